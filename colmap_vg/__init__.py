@@ -1,0 +1,76 @@
+"""Global Structure-from-Motion on the viewing graph, as a plugin for pycolmap.
+
+The public names are loaded when first used, so that the numerics import without pycolmap.
+"""
+
+import zlib  # noqa: F401  -- must come before pycolmap, whose bundled zlib otherwise breaks the process's own
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from colmap_vg._version import __version__
+
+_HOME = {
+    "ColmapVgError": "errors",
+    "EdgeVerdict": "verdicts",
+    "ImageVerdict": "verdicts",
+    "MappingOptions": "options",
+    "PoseSolution": "solution",
+    "ReadOptions": "options",
+    "Similarity": "geometry.similarity",
+    "SolutionStatus": "verdicts",
+    "SolveOptions": "options",
+    "ViewGraph": "view_graph",
+    "align_positions": "geometry.similarity",
+    "image_folder_mapping": "mapper",
+    "read_1dsfm": "datasets.one_dsfm_folder",
+    "read_bundle": "datasets.bundle",
+    "read_view_graph": "colmap_io.read",
+    "solve_view_graph": "solve",
+    "view_graph_mapping": "mapper",
+}
+
+if TYPE_CHECKING:
+    from colmap_vg.colmap_io.read import read_view_graph
+    from colmap_vg.datasets.bundle import read_bundle
+    from colmap_vg.datasets.one_dsfm_folder import read_1dsfm
+    from colmap_vg.errors import ColmapVgError
+    from colmap_vg.geometry.similarity import Similarity, align_positions
+    from colmap_vg.mapper import image_folder_mapping, view_graph_mapping
+    from colmap_vg.options import MappingOptions, ReadOptions, SolveOptions
+    from colmap_vg.solution import PoseSolution
+    from colmap_vg.solve import solve_view_graph
+    from colmap_vg.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
+    from colmap_vg.view_graph import ViewGraph
+
+__all__ = [
+    "ColmapVgError",
+    "EdgeVerdict",
+    "ImageVerdict",
+    "MappingOptions",
+    "PoseSolution",
+    "ReadOptions",
+    "Similarity",
+    "SolutionStatus",
+    "SolveOptions",
+    "ViewGraph",
+    "__version__",
+    "align_positions",
+    "image_folder_mapping",
+    "read_1dsfm",
+    "read_bundle",
+    "read_view_graph",
+    "solve_view_graph",
+    "view_graph_mapping",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'colmap_vg' has no attribute {name!r}")
+    value = getattr(import_module(f"colmap_vg.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,1 @@
+"""From COLMAP databases to view graphs, and from pose solutions to reconstructions."""

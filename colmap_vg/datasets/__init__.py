@@ -1,0 +1,1 @@
+"""Readers for published view graphs and pose graphs."""

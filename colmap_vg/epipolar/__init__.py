@@ -1,0 +1,1 @@
+"""Poses from the epipolar error of all inliers, without a 3D point."""

@@ -1,0 +1,1 @@
+"""Structure of viewing graphs: components, rigidity, cycles, outlier edges."""

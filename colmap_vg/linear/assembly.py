@@ -1,0 +1,96 @@
+"""Graph matrices assembled without a loop over edges: scalar Laplacians, incidences, block Gauss-Newton systems.
+
+The pattern of a system depends only on the edges, so it is sorted once and values are summed into it afterwards.
+"""
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def incidence(num_nodes: int, edges: IntArray) -> sp.csr_array:
+    """Incidence matrix (m, n): row k has -1 at edges[k, 0] and +1 at edges[k, 1], so that ``B @ p = p_j - p_i``."""
+    m = len(edges)
+    data = np.tile([-1.0, 1.0], m)
+    return sp.csr_array((data, edges.ravel(), np.arange(0, 2 * m + 1, 2)), shape=(m, num_nodes))
+
+
+def sum_at_nodes(num_nodes: int, nodes: IntArray, values: Array) -> Array:
+    """Sum rows of values (m, ...) at nodes (m,): (num_nodes, ...)."""
+    flat = values.reshape(len(nodes), -1)
+    out = np.empty((num_nodes, flat.shape[1]))
+    for k in range(flat.shape[1]):
+        out[:, k] = np.bincount(nodes, weights=flat[:, k], minlength=num_nodes)
+    return out.reshape(num_nodes, *values.shape[1:])
+
+
+def laplacian(num_nodes: int, edges: IntArray, weights: Array) -> sp.csc_array:
+    """Weighted graph Laplacian ``B^T diag(w) B``, (n, n)."""
+    B = incidence(num_nodes, edges)
+    return sp.csc_array(B.T @ sp.csr_array(B.multiply(weights[:, None])))
+
+
+class BlockPattern:
+    """Symmetric block matrix with a diagonal block for each node and a block for each edge, pattern fixed once.
+
+    Parameters
+    ----------
+    num_nodes : int
+    edges : (m, 2) int array
+        Parallel and reversed edges are summed.
+    block_size : int
+        Rows and columns of a block.
+    """
+
+    def __init__(self, num_nodes: int, edges: IntArray, block_size: int) -> None:
+        self.num_nodes, self.block_size = num_nodes, block_size
+        i, j = edges[:, 0].astype(np.int64), edges[:, 1].astype(np.int64)
+        nodes = np.arange(num_nodes, dtype=np.int64)
+        rows, cols = np.concatenate([nodes, i, j]), np.concatenate([nodes, j, i])
+        keys, self._slot = np.unique(cols * num_nodes + rows, return_inverse=True)
+        block_cols, block_rows = keys // num_nodes, keys % num_nodes
+        self._num_blocks = len(keys)
+        b = block_size
+        # Column-major scalars: for block column c and inner column k, its blocks in order of rows, each b entries long.
+        counts = np.bincount(block_cols, minlength=num_nodes)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        self._indptr = np.concatenate([[0], np.cumsum(np.repeat(counts * b, b))])
+        rank = np.arange(len(keys)) - starts[block_cols]
+        base = starts[block_cols] * b * b + rank * b
+        inner_col, inner_row = np.arange(b)[None, None, :], np.arange(b)[None, :, None]
+        self._position = base[:, None, None] + inner_col * (counts[block_cols] * b)[:, None, None] + inner_row
+        self._indices = np.empty(len(keys) * b * b, dtype=np.int64)
+        self._indices[self._position] = (block_rows * b)[:, None, None] + inner_row
+        self._edges = edges
+
+    def assemble(self, ii: Array, jj: Array, ij: Array, diagonal: Array | None = None) -> sp.csc_array:
+        """Sum per-edge blocks into the matrix.
+
+        Parameters
+        ----------
+        ii, jj : (m, b, b) array
+            Blocks at the edges' first and second nodes' diagonals.
+        ij : (m, b, b) array
+            Blocks at (first, second); the transposes go to (second, first).
+        diagonal : (n, b, b) array, optional
+            Added to the diagonal blocks (damping, gauge).
+
+        Returns
+        -------
+        (n b, n b) csc_array
+        """
+        n, m, b = self.num_nodes, len(self._edges), self.block_size
+        at_nodes = sum_at_nodes(n, self._edges[:, 0], ii) + sum_at_nodes(n, self._edges[:, 1], jj)
+        if diagonal is not None:
+            at_nodes = at_nodes + diagonal
+        blocks = sum_at_nodes(
+            self._num_blocks,
+            self._slot,
+            np.concatenate([at_nodes, ij, np.swapaxes(ij, 1, 2)]) if m else at_nodes,
+        )
+        data = np.empty(self._num_blocks * b * b)
+        data[self._position] = blocks
+        return sp.csc_array((data, self._indices, self._indptr), shape=(n * b, n * b))

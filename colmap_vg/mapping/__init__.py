@@ -1,0 +1,1 @@
+"""Triangulation, bundle adjustment and registration, by pycolmap."""

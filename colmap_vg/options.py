@@ -1,0 +1,79 @@
+"""Options of reading, solving and mapping: frozen dataclasses, checked when they are made."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from colmap_vg.errors import OptionError
+
+Method = Literal["epipolar", "1C", "1O", "2C", "2O", "cls", "cross", "orthogonal", "lud", "shapefit", "bata"]
+OutlierFilter = Literal["robust", "1dsfm", "none"]
+RotationAveraging = Literal["robust", "chordal"]
+
+
+def _number(default: float, low: float, high: float = float("inf")) -> Any:
+    return field(default=default, metadata={"low": low, "high": high})
+
+
+class _Checked:
+    """Checks literals, booleans, integers and ranges of a frozen dataclass's fields."""
+
+    def __post_init__(self) -> None:
+        hints = get_type_hints(type(self))
+        for f in fields(self):  # type: ignore[arg-type]
+            value, hint, where = getattr(self, f.name), hints[f.name], f"{type(self).__name__}.{f.name}"
+            if get_origin(hint) is Literal and value not in get_args(hint):
+                raise OptionError(f"{where} is {value!r}; choose one of {', '.join(map(str, get_args(hint)))}")
+            if hint is bool and not isinstance(value, bool):
+                raise OptionError(f"{where} must be True or False, found {value!r}")
+            if hint in (int, float) and (isinstance(value, bool) or not isinstance(value, int | float)):
+                raise OptionError(f"{where} must be a number, found {value!r}")
+            if hint is int and not isinstance(value, int):
+                raise OptionError(f"{where} must be an integer, found {value!r}")
+            low, high = f.metadata.get("low"), f.metadata.get("high")
+            if low is not None and not low <= value <= high:
+                raise OptionError(f"{where} is {value}, outside its range {low} to {high}")
+
+
+@dataclass(frozen=True)
+class ReadOptions(_Checked):
+    """How a viewing graph is read from a database."""
+
+    min_num_inliers: int = _number(15, 5)  # matches; edges with fewer are in the graph but not used
+    trust_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: decided from the two-view geometries
+    max_num_inliers_per_edge: int = _number(0, 0)  # matches kept as bearings per edge, spread over the image; 0: all
+    num_threads: int = _number(-1, -1)  # -1: all cores
+    random_seed: int = _number(0, 0)
+
+
+@dataclass(frozen=True)
+class SolveOptions(_Checked):
+    """How a viewing graph is solved. The paper's own chain is ``rotation_averaging="chordal"``, no gate, ``"1dsfm"``."""
+
+    method: Method = "epipolar"
+    rotation_averaging: RotationAveraging = "robust"
+    outlier_filter: OutlierFilter = "robust"
+    rotation_gate_deg: float = _number(10.0, 0.0, 180.0)  # degrees; edges beyond it are dropped; 0: no gate
+    one_dsfm_threshold: float = _number(0.1, 0.0)  # broken weight, mean |projection|
+    one_dsfm_num_directions: int = _number(48, 1)
+    direction_gate_deg: float = _number(15.0, 0.0, 180.0)  # degrees; robust filter of directions; 0: no gate
+    edge_weights: Literal["unit", "inliers"] = "inliers"  # inliers: sqrt(number), a third for planar pairs
+    accelerate: bool = True  # Anderson acceleration of the outer iterations of 1C, 1O, 2C, 2O; same fixed point
+    max_num_iterations: int = _number(1000, 1)  # outer iterations of 1C, 1O, 2C, 2O
+    convergence_tolerance: float = _number(1e-6, 0.0, 1.0)  # relative change of positions between outer iterations
+    refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal was not given
+    random_seed: int = _number(0, 0)
+
+
+@dataclass(frozen=True)
+class MappingOptions(_Checked):
+    """How a database becomes models."""
+
+    read: ReadOptions = field(default_factory=ReadOptions)
+    solve: SolveOptions = field(default_factory=SolveOptions)
+    ba_refine_focal_length: bool = True
+    ba_refine_principal_point: bool = False
+    ba_refine_extra_params: bool = True
+    extract_colors: bool = True
+    overwrite: bool = False
+    num_threads: int = _number(-1, -1)  # -1: all cores
+    random_seed: int = _number(0, 0)

@@ -1,0 +1,1 @@
+"""Translation averaging: camera positions from directions at known rotations."""

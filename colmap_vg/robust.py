@@ -1,0 +1,30 @@
+"""Robust losses as weights for iteratively reweighted least squares.
+
+Each function takes squared residuals already divided by the squared scale, and returns weights ``rho'(s)``, so that
+the weighted problem has the gradient of ``0.5 sum rho(r^2)``.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def geman_mcclure_weight(s: Array) -> Array:
+    """``rho(s) = s / (1 + s)``, weight ``1 / (1 + s)^2``."""
+    return np.asarray(1.0 / np.square(1.0 + s))
+
+
+def cauchy_weight(s: Array) -> Array:
+    """``rho(s) = log(1 + s)``, weight ``1 / (1 + s)``."""
+    return np.asarray(1.0 / (1.0 + s))
+
+
+def cauchy_loss(s: Array) -> Array:
+    """``rho(s) = log(1 + s)``."""
+    return np.log1p(s)
+
+
+def huber_weight(s: Array) -> Array:
+    """``rho(s) = s`` up to 1, then ``2 sqrt(s) - 1``; weight 1, then ``1 / sqrt(s)``."""
+    return np.asarray(1.0 / np.sqrt(np.maximum(s, 1.0)))

@@ -1,0 +1,1 @@
+"""Rotation averaging: absolute rotations from relative ones."""

@@ -1,0 +1,71 @@
+"""What a viewing-graph solve returns: poses, and a verdict for every image and edge."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.verdicts import SolutionStatus
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LogEntry:
+    """One line of the iteration log.
+
+    Attributes
+    ----------
+    stage : str
+        The solver that wrote it: ``rotations``, ``cls``, ``2O``, ``epipolar``, ...
+    iteration : int
+    cost : float
+        The stage's own objective.
+    change : float
+        Relative change on which the stage's convergence is judged.
+    """
+
+    stage: str
+    iteration: int
+    cost: float
+    change: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolution:
+    """Poses of all images of a graph, in the graph's order; rows of unregistered images hold NaN.
+
+    Attributes
+    ----------
+    image_ids : (n,) int64 array
+    cam_from_world_rotations : (n, 3, 3) array
+    projection_centers : (n, 3) array
+        Camera centres in the world frame; centroid 0, root mean square distance 1 over the registered images.
+    registered : (n,) bool array
+    component : (n,) int64 array
+        Component each image belongs to, numbered by size; -1 where unsolved.
+    focal_scales : (c,) array
+        Factor on each camera's focal length in the graph.
+    edge_kept : (m,) bool array
+    edge_verdicts : (m,) str array
+        `EdgeVerdict` words.
+    image_verdicts : (n,) str array
+        `ImageVerdict` words.
+    status : SolutionStatus
+    message : str
+        A sentence that says what happened and what to do.
+    log : tuple of LogEntry
+    """
+
+    image_ids: NDArray[np.int64]
+    cam_from_world_rotations: Array
+    projection_centers: Array
+    registered: NDArray[np.bool_]
+    component: NDArray[np.int64]
+    focal_scales: Array
+    edge_kept: NDArray[np.bool_]
+    edge_verdicts: NDArray[np.str_]
+    image_verdicts: NDArray[np.str_]
+    status: SolutionStatus
+    message: str
+    log: tuple[LogEntry, ...] = field(default=())
