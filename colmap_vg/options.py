@@ -47,7 +47,7 @@ class ReadOptions(_Checked):
 
 @dataclass(frozen=True)
 class SolveOptions(_Checked):
-    """How a viewing graph is solved. The paper's own chain is ``rotation_averaging="chordal"``, no gate, ``"1dsfm"``."""
+    """How a viewing graph is solved. The paper's chain: chordal rotation averaging, no gate, 1DSfM."""
 
     method: Method = "epipolar"
     rotation_averaging: RotationAveraging = "robust"

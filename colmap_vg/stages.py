@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 
+StageState = Literal["started", "progress", "finished", "warning"]
+
+
 @dataclass(frozen=True)
 class StageEvent:
     """Something that happened in a job.
@@ -25,7 +28,7 @@ class StageEvent:
     """
 
     stage: str
-    state: Literal["started", "progress", "finished", "warning"]
+    state: StageState
     message: str = ""
     fraction: float | None = None
     seconds: float = 0.0
@@ -94,7 +97,7 @@ class StageLog:
 
     def _emit(
         self,
-        state: Literal["started", "progress", "finished", "warning"],
+        state: StageState,
         message: str = "",
         fraction: float | None = None,
     ) -> None:

@@ -26,4 +26,4 @@ def components_by_size(num_images: int, edges: NDArray[np.int64]) -> NDArray[np.
     order = np.lexsort((first, -sizes))
     rank = np.empty(count, dtype=np.int64)
     rank[order] = np.arange(count)
-    return rank[labels]
+    return np.asarray(rank[labels])
