@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
-
 StageState = Literal["started", "progress", "finished", "warning"]
 
 

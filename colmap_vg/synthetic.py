@@ -71,7 +71,9 @@ def scene_from_poses(
     i, j = edges[:, 0], edges[:, 1]
     relative = so3.perturbed(R[j] @ np.swapaxes(R[i], 1, 2), rotation_sigma, rng)
     direction = normalized(np.einsum("kab,kb->ka", R[i], p[j] - p[i]))
-XX    outlier = np.zeros(len(edges), dtype=bool)
+    turned = so3.perturbed(np.broadcast_to(np.eye(3), relative.shape), direction_sigma, rng)
+    direction = np.einsum("kab,kb->ka", turned, direction)
+    outlier = np.zeros(len(edges), dtype=bool)
     outlier[rng.permutation(len(edges))[: round(outlier_share * len(edges))]] = True
     relative[outlier] = so3.random(int(outlier.sum()), rng)
     direction[outlier] = normalized(rng.standard_normal((int(outlier.sum()), 3)))
