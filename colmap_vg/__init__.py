@@ -12,6 +12,7 @@ from colmap_vg._version import __version__
 _HOME = {
     "ColmapVgError": "errors",
     "EdgeVerdict": "verdicts",
+    "FeatureOptions": "options",
     "ImageVerdict": "verdicts",
     "MappingOptions": "options",
     "PoseSolution": "solution",
@@ -21,7 +22,7 @@ _HOME = {
     "SolveOptions": "options",
     "ViewGraph": "view_graph",
     "align_positions": "geometry.similarity",
-    "image_folder_mapping": "mapper",
+    "image_folder_mapping": "image_folder",
     "read_1dsfm": "datasets.one_dsfm_folder",
     "read_bundle": "datasets.bundle",
     "read_view_graph": "colmap_io.read",
@@ -35,8 +36,9 @@ if TYPE_CHECKING:
     from colmap_vg.datasets.one_dsfm_folder import read_1dsfm
     from colmap_vg.errors import ColmapVgError
     from colmap_vg.geometry.similarity import Similarity, align_positions
-    from colmap_vg.mapper import image_folder_mapping, view_graph_mapping
-    from colmap_vg.options import MappingOptions, ReadOptions, SolveOptions
+    from colmap_vg.image_folder import image_folder_mapping
+    from colmap_vg.mapper import view_graph_mapping
+    from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
     from colmap_vg.solution import PoseSolution
     from colmap_vg.solve import solve_view_graph
     from colmap_vg.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ColmapVgError",
     "EdgeVerdict",
+    "FeatureOptions",
     "ImageVerdict",
     "MappingOptions",
     "PoseSolution",

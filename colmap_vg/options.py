@@ -1,6 +1,7 @@
 """Options of reading, solving and mapping: frozen dataclasses, checked when they are made."""
 
 from dataclasses import dataclass, field, fields
+from os import PathLike
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from colmap_vg.errors import OptionError
@@ -8,6 +9,8 @@ from colmap_vg.errors import OptionError
 Method = Literal["epipolar", "1C", "1O", "2C", "2O", "cls", "cross", "orthogonal", "lud", "shapefit", "bata"]
 OutlierFilter = Literal["robust", "1dsfm", "none"]
 RotationAveraging = Literal["robust", "chordal"]
+CameraMode = Literal["auto", "single", "per_folder", "per_image"]
+Matching = Literal["exhaustive", "sequential", "spatial"]
 
 
 def _number(default: float, low: float, high: float = float("inf")) -> Any:
@@ -61,6 +64,23 @@ class SolveOptions(_Checked):
     max_num_iterations: int = _number(1000, 1)  # outer iterations of 1C, 1O, 2C, 2O
     convergence_tolerance: float = _number(1e-6, 0.0, 1.0)  # relative change of positions between outer iterations
     refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal was not given
+    random_seed: int = _number(0, 0)
+
+
+@dataclass(frozen=True)
+class FeatureOptions(_Checked):
+    """How a folder of photographs becomes a database. Features are SIFT, on the CPU."""
+
+    camera_model: str = "SIMPLE_RADIAL"
+    camera_params: tuple[float, ...] = ()  # in the model's order, pixels; empty: from EXIF, else guessed
+    camera_mode: CameraMode = "auto"  # auto: COLMAP's, which shares a camera only where EXIF says so
+    matching: Matching = "exhaustive"
+    image_list_path: str | PathLike[str] | None = None  # file with one image name a line; None: all of the folder
+    mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png for image NAME; black hides features
+    max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are shrunk for extraction; -1: COLMAP's
+    max_num_features: int = _number(8192, 1)  # per image
+    sequential_overlap: int = _number(10, 1)  # images; each is matched with so many followers
+    num_threads: int = _number(-1, -1)  # -1: all cores
     random_seed: int = _number(0, 0)
 
 
