@@ -1,0 +1,240 @@
+"""Features and matches of a folder of photographs, into a COLMAP database.
+
+pycolmap reads the EXIF orientation itself: features are found on the upright image, and written in the pixels of the
+image as it is stored, with the camera of the stored size. So photographs of one phone share their camera's geometry
+however it was held, and nothing has to be rotated here.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from colmap_vg.errors import ImageFolderError, OptionError
+from colmap_vg.features.photographs import SkippedFile, find_photographs, split_odd_sizes, split_unmasked
+from colmap_vg.options import FeatureOptions
+from colmap_vg.stages import StageLog
+
+MIN_IMAGES = 3
+"""Images; two views have no redundancy that could tell a right model from a wrong one."""
+
+IMAGES_PER_CALL = 16
+"""Images per thread and call of pycolmap: progress is told between calls, and a call ends with idle threads."""
+
+
+@dataclass(frozen=True)
+class FeatureResult:
+    """What was put into a database.
+
+    Attributes
+    ----------
+    image_names : tuple of str
+        Images of the database, by name.
+    skipped : tuple of SkippedFile
+        Files that are left out, each with the reason.
+    num_verified_pairs : int
+    """
+
+    image_names: tuple[str, ...]
+    skipped: tuple[SkippedFile, ...]
+    num_verified_pairs: int
+
+
+def extract_and_match(
+    image_path: str | PathLike[str],
+    database_path: str | PathLike[str],
+    options: FeatureOptions | None = None,
+    log: StageLog | None = None,
+) -> FeatureResult:
+    """Make a database of features and verified matches from a folder of photographs.
+
+    What the database already holds is kept: an interrupted job goes on where it stopped.
+
+    Parameters
+    ----------
+    image_path : path
+        Folder of photographs, searched recursively.
+    database_path : path
+        Created when missing.
+    options : FeatureOptions, optional
+    log : StageLog, optional
+
+    Returns
+    -------
+    FeatureResult
+
+    Raises
+    ------
+    ImageFolderError
+        The folder is missing, or holds fewer than three photographs that can be used.
+    OptionError
+        The camera model is unknown, or does not take so many parameters.
+    """
+    options, log = options or FeatureOptions(), log or StageLog()
+    reader_options = _reader_options(options)
+    with log.stage("photographs"):
+        names, skipped = check_photographs(image_path, options, log)
+        log.result(f"{len(names)} photographs" + (f", {len(skipped)} files skipped" if skipped else ""))
+    with log.stage("features"):
+        names, unreadable = _extract(Path(image_path), Path(database_path), names, options, reader_options, log)
+    with log.stage("matching"):
+        num_pairs = _match(Path(database_path), options, log)
+    return FeatureResult(tuple(names), (*skipped, *unreadable), num_pairs)
+
+
+def check_photographs(
+    image_path: str | PathLike[str], options: FeatureOptions, log: StageLog
+) -> tuple[list[str], list[SkippedFile]]:
+    """Names of the photographs that can be used, and the files that cannot; each of these is named as a warning.
+
+    Raises
+    ------
+    ImageFolderError
+        Fewer than three photographs can be used.
+    """
+    listed = None if options.image_list_path is None else read_image_list(options.image_list_path)
+    exclude = () if options.mask_path is None else (Path(options.mask_path),)
+    photographs, skipped = find_photographs(image_path, listed, exclude)
+    photographs, odd = split_odd_sizes(photographs, options.camera_mode, bool(options.camera_params))
+    skipped += odd
+    if options.mask_path is not None:
+        photographs, unmasked = split_unmasked(photographs, options.mask_path)
+        skipped += unmasked
+    for file in skipped:
+        log.warn(f"skipped {file.name}: {file.reason}")
+    _require_enough(len(photographs), image_path, skipped)
+    return [photograph.name for photograph in photographs], skipped
+
+
+def read_image_list(path: str | PathLike[str]) -> list[str]:
+    """Names from a file with one image name a line; empty lines and ``#`` comments do not count.
+
+    Raises
+    ------
+    ImageFolderError
+        The file is missing, is no text, or names nothing.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImageFolderError(f"cannot read the image list {path}: {error}; check --image_list_path") from error
+    names = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if not names:
+        raise ImageFolderError(f"the image list {path} names no image")
+    return names
+
+
+def _require_enough(num_images: int, image_path: str | PathLike[str], skipped: Sequence[SkippedFile]) -> None:
+    if num_images >= MIN_IMAGES:
+        return
+    found = f"{num_images} photograph{'' if num_images == 1 else 's'}" if num_images else "no photograph"
+    reasons = f" ({len(skipped)} files were skipped, the first is {skipped[0].name}: {skipped[0].reason})"
+    raise ImageFolderError(
+        f"{image_path} holds {found} that can be used; a model needs at least {MIN_IMAGES}{reasons if skipped else ''}"
+    )
+
+
+def _reader_options(options: FeatureOptions) -> pycolmap.ImageReaderOptions:
+    models = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
+    if options.camera_model not in models:
+        raise OptionError(f"unknown camera model {options.camera_model!r}; choose one of {', '.join(sorted(models))}")
+    reader_options = pycolmap.ImageReaderOptions()
+    reader_options.camera_model = options.camera_model
+    if options.camera_params:
+        example = pycolmap.Camera.create_from_model_name(1, options.camera_model, 1.0, 1, 1)
+        if len(options.camera_params) != len(example.params):
+            raise OptionError(
+                f"{options.camera_model} takes {len(example.params)} camera parameters ({example.params_info}), "
+                f"found {len(options.camera_params)}"
+            )
+        if not np.all(np.isfinite(options.camera_params)):
+            raise OptionError(f"camera parameters must be finite numbers, found {options.camera_params}")
+        reader_options.camera_params = ",".join(repr(float(value)) for value in options.camera_params)
+    if options.mask_path is not None:
+        reader_options.mask_path = options.mask_path
+    return reader_options
+
+
+def _extract(
+    image_path: Path,
+    database_path: Path,
+    names: list[str],
+    options: FeatureOptions,
+    reader_options: pycolmap.ImageReaderOptions,
+    log: StageLog,
+) -> tuple[list[str], list[SkippedFile]]:
+    camera_mode = pycolmap.CameraMode.__members__[options.camera_mode.upper()]
+    with pycolmap.Database.open(database_path) as database:
+        known = {image.name for image in database.read_all_images()}
+    # Importing first, in one thread, numbers images and cameras by name: extraction alone numbers them as threads end.
+    new = [name for name in names if name not in known]
+    if new:
+        pycolmap.import_images(database_path, image_path, camera_mode, new, reader_options)
+    with pycolmap.Database.open(database_path) as database:
+        known = {image.name for image in database.read_all_images()}
+    unreadable = [SkippedFile(name, "COLMAP cannot read it") for name in names if name not in known]
+    for file in unreadable:
+        log.warn(f"skipped {file.name}: {file.reason}")
+    names = [name for name in names if name in known]
+    _require_enough(len(names), image_path, unreadable)
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = options.num_threads
+    extraction.max_image_size = options.max_image_size
+    extraction.sift.max_num_features = options.max_num_features
+    threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
+    step = IMAGES_PER_CALL * threads
+    for start in range(0, len(names), step):
+        log.progress(f"{start} of {len(names)} photographs", start / len(names))
+        part = names[start : start + step]
+        pycolmap.extract_features(
+            database_path, image_path, part, camera_mode, reader_options, extraction, pycolmap.Device.cpu
+        )
+    with pycolmap.Database.open(database_path) as database:
+        counts = {image.name: database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()}
+    blank = [name for name in names if counts[name] == 0]
+    if blank:
+        log.warn(f"no features were found in {', '.join(blank)}: they cannot be matched")
+    log.result(f"{sum(counts[name] for name in names)} features in {len(names)} photographs")
+    return names, unreadable
+
+
+def _match(database_path: Path, options: FeatureOptions, log: StageLog) -> int:
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = options.num_threads
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = options.random_seed
+    device = pycolmap.Device.cpu
+    if options.matching == "exhaustive":
+        pairing = pycolmap.ExhaustivePairingOptions()
+        pycolmap.match_exhaustive(database_path, matching, pairing, verification, device)
+    elif options.matching == "sequential":
+        sequential = pycolmap.SequentialPairingOptions()
+        sequential.overlap = options.sequential_overlap
+        sequential.num_threads = options.num_threads
+        pycolmap.match_sequential(database_path, matching, sequential, verification, device)
+    else:
+        _require_positions(database_path)
+        spatial = pycolmap.SpatialPairingOptions()
+        spatial.num_threads = options.num_threads
+        pycolmap.match_spatial(database_path, matching, spatial, verification, device)
+    with pycolmap.Database.open(database_path) as database:
+        num_matched, num_verified = database.num_matched_image_pairs(), database.num_verified_image_pairs()
+    log.result(f"{num_verified} verified of {num_matched} matched pairs")
+    return int(num_verified)
+
+
+def _require_positions(database_path: Path) -> None:
+    with pycolmap.Database.open(database_path) as database:
+        positions = [prior.position for prior in database.read_all_pose_priors()]
+    num_located = sum(bool(np.all(np.isfinite(position))) for position in positions)
+    if num_located < MIN_IMAGES:
+        raise ImageFolderError(
+            f"{num_located} photographs have a GPS position; spatial matching needs them: use --matching exhaustive"
+        )
