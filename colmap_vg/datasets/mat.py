@@ -12,6 +12,7 @@ import numpy as np
 import scipy.io
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.io.matlab import MatReadError
 
 from colmap_vg.errors import DataFileError
 from colmap_vg.geometry import so3
@@ -93,7 +94,7 @@ def read_topology_mat(path: str | Path) -> tuple[int, IntArray]:
 def _load(path: str | Path, names: tuple[str, ...]) -> dict[str, Any]:
     try:
         content: dict[str, Any] = scipy.io.loadmat(path)
-    except (OSError, ValueError, NotImplementedError, TypeError) as error:
+    except (OSError, ValueError, NotImplementedError, TypeError, MatReadError) as error:
         raise DataFileError(f"{path}: cannot be read as a MATLAB file ({error})") from error
     for name in names:
         if name not in content:
