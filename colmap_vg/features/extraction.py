@@ -75,14 +75,9 @@ def extract_and_match(
         The camera model is unknown, or does not take so many parameters.
     """
     options, log = options or FeatureOptions(), log or StageLog()
-    reader_options = _reader_options(options)
-    with log.stage("photographs"):
-        names, skipped = check_photographs(image_path, options, log)
-        log.result(f"{len(names)} photographs" + (f", {len(skipped)} files skipped" if skipped else ""))
-    with log.stage("features"):
-        names, unreadable = _extract(Path(image_path), Path(database_path), names, options, reader_options, log)
-    with log.stage("matching"):
-        num_pairs = _match(Path(database_path), options, log)
+    names, skipped = check_photographs(image_path, options, log)
+    names, unreadable = extract_features(image_path, database_path, names, options, log)
+    num_pairs = match_features(database_path, options, log)
     return FeatureResult(tuple(names), (*skipped, *unreadable), num_pairs)
 
 
@@ -95,7 +90,19 @@ def check_photographs(
     ------
     ImageFolderError
         Fewer than three photographs can be used.
+    OptionError
+        The camera model is unknown, or does not take so many parameters.
     """
+    _reader_options(options)
+    with log.stage("photographs"):
+        names, skipped = _usable_photographs(image_path, options, log)
+        log.result(f"{len(names)} photographs" + (f", {len(skipped)} files skipped" if skipped else ""))
+    return names, skipped
+
+
+def _usable_photographs(
+    image_path: str | PathLike[str], options: FeatureOptions, log: StageLog
+) -> tuple[list[str], list[SkippedFile]]:
     listed = None if options.image_list_path is None else read_image_list(options.image_list_path)
     exclude = () if options.mask_path is None else (Path(options.mask_path),)
     photographs, skipped = find_photographs(image_path, listed, exclude)
@@ -159,34 +166,68 @@ def _reader_options(options: FeatureOptions) -> pycolmap.ImageReaderOptions:
     return reader_options
 
 
-def _extract(
-    image_path: Path,
-    database_path: Path,
-    names: list[str],
+def extract_features(
+    image_path: str | PathLike[str],
+    database_path: str | PathLike[str],
+    names: Sequence[str],
     options: FeatureOptions,
-    reader_options: pycolmap.ImageReaderOptions,
     log: StageLog,
 ) -> tuple[list[str], list[SkippedFile]]:
-    camera_mode = pycolmap.CameraMode.__members__[options.camera_mode.upper()]
-    with pycolmap.Database.open(database_path) as database:
-        known = {image.name for image in database.read_all_images()}
-    # Importing first, in one thread, numbers images and cameras by name: extraction alone numbers them as threads end.
+    """Put cameras, images and SIFT features of the named photographs into a database.
+
+    Returns
+    -------
+    names : list of str
+        Those that COLMAP could read.
+    skipped : list of SkippedFile
+        The others.
+
+    Raises
+    ------
+    ImageFolderError
+        COLMAP could read fewer than three of them.
+    """
+    with log.stage("features"):
+        readable, unreadable = _import_images(image_path, database_path, names, options, log)
+        _extract(image_path, database_path, readable, options, log)
+    return readable, unreadable
+
+
+def _import_images(
+    image_path: str | PathLike[str],
+    database_path: str | PathLike[str],
+    names: Sequence[str],
+    options: FeatureOptions,
+    log: StageLog,
+) -> tuple[list[str], list[SkippedFile]]:
+    """Number images and cameras by name, in one thread: extraction alone numbers them as its threads end."""
+    known = _image_names(database_path)
     new = [name for name in names if name not in known]
     if new:
-        pycolmap.import_images(database_path, image_path, camera_mode, new, reader_options)
-    with pycolmap.Database.open(database_path) as database:
-        known = {image.name for image in database.read_all_images()}
+        log.progress("reading the photographs")
+        pycolmap.import_images(database_path, image_path, _camera_mode(options), new, _reader_options(options))
+        known = _image_names(database_path)
     unreadable = [SkippedFile(name, "COLMAP cannot read it") for name in names if name not in known]
     for file in unreadable:
         log.warn(f"skipped {file.name}: {file.reason}")
-    names = [name for name in names if name in known]
-    _require_enough(len(names), image_path, unreadable)
+    readable = [name for name in names if name in known]
+    _require_enough(len(readable), image_path, unreadable)
+    return readable, unreadable
 
+
+def _extract(
+    image_path: str | PathLike[str],
+    database_path: str | PathLike[str],
+    names: Sequence[str],
+    options: FeatureOptions,
+    log: StageLog,
+) -> None:
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
     extraction.num_threads = options.num_threads
     extraction.max_image_size = options.max_image_size
     extraction.sift.max_num_features = options.max_num_features
+    camera_mode, reader_options = _camera_mode(options), _reader_options(options)
     threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
     step = IMAGES_PER_CALL * threads
     for start in range(0, len(names), step):
@@ -201,10 +242,35 @@ def _extract(
     if blank:
         log.warn(f"no features were found in {', '.join(blank)}: they cannot be matched")
     log.result(f"{sum(counts[name] for name in names)} features in {len(names)} photographs")
-    return names, unreadable
 
 
-def _match(database_path: Path, options: FeatureOptions, log: StageLog) -> int:
+def _camera_mode(options: FeatureOptions) -> pycolmap.CameraMode:
+    return pycolmap.CameraMode.__members__[options.camera_mode.upper()]
+
+
+def _image_names(database_path: str | PathLike[str]) -> set[str]:
+    with pycolmap.Database.open(database_path) as database:
+        return {image.name for image in database.read_all_images()}
+
+
+def match_features(database_path: str | PathLike[str], options: FeatureOptions, log: StageLog) -> int:
+    """Match the features of a database's images and verify the pairs; pairs that it already holds are kept.
+
+    Returns
+    -------
+    int
+        Number of verified pairs in the database.
+
+    Raises
+    ------
+    ImageFolderError
+        Spatial matching is asked for, and the photographs have no GPS positions.
+    """
+    with log.stage("matching"):
+        return _match(database_path, options, log)
+
+
+def _match(database_path: str | PathLike[str], options: FeatureOptions, log: StageLog) -> int:
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = options.num_threads
@@ -230,7 +296,7 @@ def _match(database_path: Path, options: FeatureOptions, log: StageLog) -> int:
     return int(num_verified)
 
 
-def _require_positions(database_path: Path) -> None:
+def _require_positions(database_path: str | PathLike[str]) -> None:
     with pycolmap.Database.open(database_path) as database:
         positions = [prior.position for prior in database.read_all_pose_priors()]
     num_located = sum(bool(np.all(np.isfinite(position))) for position in positions)

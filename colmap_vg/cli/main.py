@@ -1,0 +1,380 @@
+"""The verbs of ``colmap-vg`` and their flags. What they do is in `colmap_vg.cli.jobs`, loaded when a verb runs."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from colmap_vg._version import __version__
+from colmap_vg.cli import colmap_flags
+from colmap_vg.cli.reporter import Reporter
+from colmap_vg.errors import ColmapVgError, OptionError
+from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+
+INTERRUPTED = 130
+"""Exit code of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
+
+METHODS = "epipolar|1C|1O|2C|2O|cls|cross|orthogonal|lud|shapefit|bata"
+DEFAULTS = MappingOptions()
+
+app = typer.Typer(
+    name="colmap-vg",
+    help="Structure-from-Motion on the viewing graph: photographs or a COLMAP database in, a COLMAP model out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its tables cut long flag names off
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ImagePath = Annotated[Path, typer.Option("--image_path", help="Folder of photographs, searched recursively.")]
+MapperImagePath = Annotated[
+    Path | None, typer.Option("--image_path", help="Folder of the photographs, for colours; may be left out.")
+]
+DatabasePath = Annotated[Path, typer.Option("--database_path", help="COLMAP database; it is never modified.")]
+OutputPath = Annotated[Path, typer.Option("--output_path", help="Folder for the results; created when missing.")]
+CameraModel = Annotated[str, typer.Option("--camera_model", help="COLMAP camera model.")]
+CameraParams = Annotated[
+    str, typer.Option("--camera_params", metavar="F,CX,CY,...", help="Calibration in the model's order, pixels.")
+]
+CameraMode = Annotated[
+    str, typer.Option("--camera_mode", metavar="auto|single|per_folder|per_image", help="Which images share a camera.")
+]
+Matching = Annotated[
+    str, typer.Option("--matching", metavar="exhaustive|sequential|spatial", help="Which pairs are matched.")
+]
+ImageListPath = Annotated[
+    Path | None, typer.Option("--image_list_path", help="Text file with one image name a line: only these are used.")
+]
+MaskPath = Annotated[
+    Path | None, typer.Option("--mask_path", help="Folder of masks, NAME.png for image NAME; black hides features.")
+]
+MaxImageSize = Annotated[int, typer.Option("--max_image_size", help="Pixels; -1: COLMAP's default.")]
+MaxNumFeatures = Annotated[int, typer.Option("--max_num_features", help="SIFT features per image, at most.")]
+Method = Annotated[str, typer.Option("--method", metavar=METHODS, help="How positions are solved.")]
+RotationAveraging = Annotated[str, typer.Option("--rotation_averaging", metavar="robust|chordal")]
+OutlierFilter = Annotated[str, typer.Option("--outlier_filter", metavar="robust|1dsfm|none")]
+RotationGate = Annotated[
+    float, typer.Option(*colmap_flags.ROTATION_GATE, help="Degrees; edges further off are dropped; 0: no gate.")
+]
+EdgeWeights = Annotated[str, typer.Option("--edge_weights", metavar="inliers|unit")]
+TrustFocalLengths = Annotated[
+    str, typer.Option("--trust_focal_lengths", metavar="auto|always|never", help="Of the database's cameras.")
+]
+MinNumMatches = Annotated[
+    int, typer.Option(*colmap_flags.MIN_NUM_MATCHES, help="Pairs with fewer inlier matches are not used.")
+]
+RefineFocalLength = Annotated[str, typer.Option(*colmap_flags.REFINE_FOCAL_LENGTH, metavar="0|1")]
+RefinePrincipalPoint = Annotated[str, typer.Option(*colmap_flags.REFINE_PRINCIPAL_POINT, metavar="0|1")]
+RefineExtraParams = Annotated[
+    str, typer.Option(*colmap_flags.REFINE_EXTRA_PARAMS, metavar="0|1", help="Distortion, in bundle adjustment.")
+]
+RefineIntrinsics = Annotated[
+    str, typer.Option(*colmap_flags.REFINE_INTRINSICS, metavar="0|1", help="GLOMAP's: focal length and distortion.")
+]
+ExtractColors = Annotated[str, typer.Option(*colmap_flags.EXTRACT_COLORS, metavar="0|1")]
+NumThreads = Annotated[int, typer.Option(*colmap_flags.NUM_THREADS, help="-1: all cores.")]
+RandomSeed = Annotated[int, typer.Option(*colmap_flags.RANDOM_SEED, help="Same seed and threads, same result.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the models that the output folder holds.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Reuse the finished stages of an interrupted run.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Show every event, and COLMAP's own log.")]
+
+
+@app.callback(invoke_without_command=True)
+def version_only(
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.", is_eager=True)] = False,
+) -> None:
+    """Structure-from-Motion on the viewing graph: photographs or a COLMAP database in, a COLMAP model out."""
+    if version:
+        typer.echo(f"colmap-vg {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def run(
+    image_path: ImagePath,
+    output_path: OutputPath,
+    camera_model: CameraModel = "SIMPLE_RADIAL",
+    camera_params: CameraParams = "",
+    camera_mode: CameraMode = "auto",
+    matching: Matching = "exhaustive",
+    image_list_path: ImageListPath = None,
+    mask_path: MaskPath = None,
+    max_image_size: MaxImageSize = -1,
+    max_num_features: MaxNumFeatures = 8192,
+    method: Method = DEFAULTS.solve.method,
+    rotation_averaging: RotationAveraging = DEFAULTS.solve.rotation_averaging,
+    outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
+    rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
+    edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
+    trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
+    ba_refine_focal_length: RefineFocalLength = "1",
+    ba_refine_principal_point: RefinePrincipalPoint = "0",
+    ba_refine_extra_params: RefineExtraParams = "1",
+    extract_colors: ExtractColors = "1",
+    num_threads: NumThreads = -1,
+    random_seed: RandomSeed = 0,
+    overwrite: Overwrite = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """From a folder of photographs to models: features, matching, viewing graph, triangulation, bundle adjustment."""
+    with _job(quiet, verbose) as reporter:
+        features = FeatureOptions(
+            camera_model=camera_model,
+            camera_params=_numbers("--camera_params", camera_params),
+            camera_mode=camera_mode,  # type: ignore[arg-type]  # checked by the dataclass
+            matching=matching,  # type: ignore[arg-type]
+            image_list_path=image_list_path,
+            mask_path=mask_path,
+            max_image_size=max_image_size,
+            max_num_features=max_num_features,
+            num_threads=num_threads,
+            random_seed=_seed(random_seed),
+        )
+        options = _mapping_options(
+            _read_options(trust_focal_lengths, min_num_matches, num_threads, random_seed),
+            _solve_options(
+                method,
+                rotation_averaging,
+                outlier_filter,
+                rotation_gate_deg,
+                edge_weights,
+                ba_refine_focal_length,
+                random_seed,
+            ),
+            ba_refine_focal_length,
+            ba_refine_principal_point,
+            ba_refine_extra_params,
+            extract_colors,
+            overwrite,
+            num_threads,
+            random_seed,
+        )
+        from colmap_vg.cli import jobs
+
+        jobs.run(image_path, output_path, features, options, resume, reporter)
+
+
+@app.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def mapper(
+    context: typer.Context,
+    database_path: DatabasePath,
+    output_path: OutputPath,
+    image_path: MapperImagePath = None,
+    method: Method = DEFAULTS.solve.method,
+    rotation_averaging: RotationAveraging = DEFAULTS.solve.rotation_averaging,
+    outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
+    rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
+    edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
+    trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
+    ba_refine_focal_length: RefineFocalLength = "1",
+    ba_refine_principal_point: RefinePrincipalPoint = "0",
+    ba_refine_extra_params: RefineExtraParams = "1",
+    optimize_intrinsics: RefineIntrinsics = "",
+    extract_colors: ExtractColors = "1",
+    num_threads: NumThreads = -1,
+    random_seed: RandomSeed = 0,
+    overwrite: Overwrite = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """From a COLMAP database to models. Takes the flags of colmap's and glomap's mappers.
+
+    Of those flags the ones listed here are obeyed; the others are accepted with a warning that names them.
+    """
+    if optimize_intrinsics:
+        ba_refine_focal_length = ba_refine_extra_params = optimize_intrinsics
+    try:
+        ignored = colmap_flags.ignored_flags(context.args)
+    except colmap_flags.UnknownArgumentError as error:
+        raise typer.BadParameter(str(error)) from None
+    with _job(quiet, verbose) as reporter:
+        options = _mapping_options(
+            _read_options(trust_focal_lengths, min_num_matches, num_threads, random_seed),
+            _solve_options(
+                method,
+                rotation_averaging,
+                outlier_filter,
+                rotation_gate_deg,
+                edge_weights,
+                ba_refine_focal_length,
+                random_seed,
+            ),
+            ba_refine_focal_length,
+            ba_refine_principal_point,
+            ba_refine_extra_params,
+            extract_colors,
+            overwrite,
+            num_threads,
+            random_seed,
+        )
+        for flag in ignored:
+            reporter.warn(f"{flag} has no counterpart in colmap-vg and is ignored")
+        from colmap_vg.cli import jobs
+
+        jobs.mapper(database_path, image_path, output_path, options, resume, reporter)
+
+
+@app.command()
+def solve(
+    database_path: DatabasePath,
+    output_path: OutputPath,
+    method: Method = DEFAULTS.solve.method,
+    rotation_averaging: RotationAveraging = DEFAULTS.solve.rotation_averaging,
+    outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
+    rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
+    edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
+    trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
+    ba_refine_focal_length: RefineFocalLength = "1",
+    num_threads: NumThreads = -1,
+    random_seed: RandomSeed = 0,
+    overwrite: Overwrite = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """The viewing graph only: OUT/0 holds poses without points."""
+    with _job(quiet, verbose) as reporter:
+        read = _read_options(trust_focal_lengths, min_num_matches, num_threads, random_seed)
+        options = _solve_options(
+            method,
+            rotation_averaging,
+            outlier_filter,
+            rotation_gate_deg,
+            edge_weights,
+            ba_refine_focal_length,
+            random_seed,
+        )
+        from colmap_vg.cli import jobs
+
+        jobs.solve(database_path, output_path, read, options, overwrite, resume, reporter)
+
+
+@app.command()
+def demo(
+    output_path: OutputPath,
+    num_images: Annotated[int, typer.Option("--num_images", min=3, help="Photographs to render.")] = 24,
+    seed: Annotated[int, typer.Option("--seed", "--random_seed", min=0, help="Of scene, cameras and noise.")] = 0,
+    num_threads: NumThreads = -1,
+    overwrite: Overwrite = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Render photographs of a scene from known cameras, make a model of them, and compare it with the truth."""
+    with _job(quiet, verbose) as reporter:
+        from colmap_vg.cli import jobs
+
+        jobs.demo(output_path, num_images, seed, num_threads, overwrite, resume, reporter)
+
+
+def main() -> None:
+    """Entry point of ``colmap-vg`` and ``python -m colmap_vg``."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+
+
+@contextmanager
+def _job(quiet: bool, verbose: bool) -> Iterator[Reporter]:
+    """A reporter for the job, whose expected ends become exit codes with one line on standard error."""
+    if quiet and verbose:
+        raise typer.BadParameter("--quiet and --verbose contradict each other")
+    try:
+        with Reporter(quiet, verbose) as reporter:
+            yield reporter
+    except OptionError as error:
+        raise typer.BadParameter(_one_line(error)) from error
+    except ColmapVgError as error:
+        typer.echo(f"error: {_one_line(error)}", err=True)
+        raise typer.Exit(1) from error
+    except KeyboardInterrupt:
+        typer.echo("interrupted; finished stages are kept: go on with --resume", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _boolean(flag: str, value: str) -> bool:
+    parsed = colmap_flags.parse_boolean(value)
+    if parsed is None:
+        raise typer.BadParameter(f"{flag} takes 0, 1, true or false, found {value!r}")
+    return parsed
+
+
+def _numbers(flag: str, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(",")) if text.strip() else ()
+    except ValueError:
+        raise typer.BadParameter(f"{flag} takes numbers separated by commas, found {text!r}") from None
+
+
+def _seed(random_seed: int) -> int:
+    return 0 if random_seed == -1 else random_seed  # COLMAP's -1 asks for its default
+
+
+def _read_options(trust_focal_lengths: str, min_num_matches: int, num_threads: int, random_seed: int) -> ReadOptions:
+    return ReadOptions(
+        min_num_inliers=min_num_matches,
+        trust_focal_lengths=trust_focal_lengths,  # type: ignore[arg-type]
+        num_threads=num_threads,
+        random_seed=_seed(random_seed),
+    )
+
+
+def _solve_options(
+    method: str,
+    rotation_averaging: str,
+    outlier_filter: str,
+    rotation_gate_deg: float,
+    edge_weights: str,
+    ba_refine_focal_length: str,
+    random_seed: int,
+) -> SolveOptions:
+    refine = _boolean("--ba_refine_focal_length", ba_refine_focal_length)
+    return SolveOptions(
+        method=method,  # type: ignore[arg-type]
+        rotation_averaging=rotation_averaging,  # type: ignore[arg-type]
+        outlier_filter=outlier_filter,  # type: ignore[arg-type]
+        rotation_gate_deg=rotation_gate_deg,
+        edge_weights=edge_weights,  # type: ignore[arg-type]
+        refine_focal_lengths="auto" if refine else "never",
+        random_seed=_seed(random_seed),
+    )
+
+
+def _mapping_options(
+    read: ReadOptions,
+    solve: SolveOptions,
+    ba_refine_focal_length: str,
+    ba_refine_principal_point: str,
+    ba_refine_extra_params: str,
+    extract_colors: str,
+    overwrite: bool,
+    num_threads: int,
+    random_seed: int,
+) -> MappingOptions:
+    return MappingOptions(
+        read=read,
+        solve=solve,
+        ba_refine_focal_length=_boolean("--ba_refine_focal_length", ba_refine_focal_length),
+        ba_refine_principal_point=_boolean("--ba_refine_principal_point", ba_refine_principal_point),
+        ba_refine_extra_params=_boolean("--ba_refine_extra_params", ba_refine_extra_params),
+        extract_colors=_boolean("--extract_colors", extract_colors),
+        overwrite=overwrite,
+        num_threads=num_threads,
+        random_seed=_seed(random_seed),
+    )

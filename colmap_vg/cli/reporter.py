@@ -1,0 +1,104 @@
+"""Shows the events of a job: a live line on a terminal, plain lines otherwise, and keeps them for the summary."""
+
+import sys
+import time
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from colmap_vg.stages import StageEvent, StageRecord, peak_memory_mib
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+PLAIN_INTERVAL = 10.0
+"""Seconds between two plain progress lines of one stage, so that log files stay short."""
+
+
+@dataclass
+class Reporter:
+    """Shows stage events and remembers stages and warnings.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing; stages and warnings are remembered all the same.
+    verbose : bool
+        Show every event.
+    """
+
+    quiet: bool = False
+    verbose: bool = False
+    records: list[StageRecord] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    _progress: "Progress | None" = None
+    _task: "TaskID | None" = None
+    _last_line: float = 0.0
+
+    def __enter__(self) -> Self:
+        if not self.quiet and sys.stdout.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+            columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+            self._progress = Progress(*columns, console=Console(highlight=False), transient=True)
+            self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def on_event(self, event: StageEvent) -> None:
+        """Take one event of the job."""
+        if event.state == "warning":
+            self.warn(event.message)
+        elif event.state == "finished":
+            self.records.append(StageRecord(event.stage, event.seconds, peak_memory_mib(), event.message))
+            self._clear_task()
+            self.say(f"{event.stage}: {event.message or 'done'} ({event.seconds:.1f} s)")
+        elif event.state == "started":
+            self._last_line = time.perf_counter()
+            self._start_task(event.stage)
+            if self.verbose:
+                self.say(f"{event.stage}: started")
+        else:
+            self._advance(event)
+
+    def warn(self, message: str) -> None:
+        """Show a caveat and keep it for the summary."""
+        self.warnings.append(message)
+        self.say(f"warning: {message}")
+
+    def say(self, line: str) -> None:
+        """Show a line."""
+        if self.quiet:
+            return
+        if self._progress is not None:
+            self._progress.console.print(line, markup=False)
+        else:
+            print(line, flush=True)
+
+    def _start_task(self, stage: str) -> None:
+        if self._progress is not None:
+            self._clear_task()
+            self._task = self._progress.add_task(stage, total=None)
+
+    def _clear_task(self) -> None:
+        if self._progress is not None and self._task is not None:
+            self._progress.remove_task(self._task)
+            self._task = None
+
+    def _advance(self, event: StageEvent) -> None:
+        line = f"{event.stage}: {event.message}" if event.message else event.stage
+        if self._progress is not None and self._task is not None:
+            total = None if event.fraction is None else 1.0
+            self._progress.update(self._task, description=line, total=total, completed=event.fraction or 0.0)
+        due = time.perf_counter() - self._last_line > PLAIN_INTERVAL
+        if self.verbose or (self._progress is None and due):
+            self._last_line = time.perf_counter()
+            share = "" if event.fraction is None else f" ({100 * event.fraction:.0f} %)"
+            self.say(f"{line}{share}")

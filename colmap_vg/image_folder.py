@@ -1,0 +1,169 @@
+"""From a folder of photographs to models: features, matching and mapping in one output folder, with resume.
+
+The database is made as ``OUT/.work/database.db`` and becomes ``OUT/database.db`` when it is finished, so a database in
+the output folder is never half made. ``OUT/.work/features.json`` says from what it was made.
+"""
+
+import json
+import shutil
+import sqlite3
+from collections.abc import Callable
+from dataclasses import asdict
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_vg.errors import OutputError
+from colmap_vg.features.extraction import FeatureResult, check_photographs, extract_features, match_features
+from colmap_vg.mapper import view_graph_mapping
+from colmap_vg.options import FeatureOptions, MappingOptions
+from colmap_vg.stages import StageEvent, StageLog
+
+if TYPE_CHECKING:
+    import pycolmap
+
+DATABASE_NAME = "database.db"
+WORK_NAME = ".work"
+RECORD_NAME = "features.json"
+
+
+def image_folder_mapping(
+    image_path: str | PathLike[str],
+    output_path: str | PathLike[str],
+    features: FeatureOptions | None = None,
+    options: MappingOptions | None = None,
+    on_event: Callable[[StageEvent], None] | None = None,
+) -> "dict[int, pycolmap.Reconstruction]":
+    """Make models from a folder of photographs: features, matching, viewing graph, triangulation, bundle adjustment.
+
+    Parameters
+    ----------
+    image_path : path
+        Folder of photographs, searched recursively.
+    output_path : path
+        Receives ``database.db`` and the models ``0``, ``1``, ...
+    features : FeatureOptions, optional
+    options : MappingOptions, optional
+        With ``overwrite``, models and a database that are there already are replaced.
+    on_event : callable, optional
+        Called with a `StageEvent` whenever a stage starts, gets on, ends, or has something to warn of.
+
+    Returns
+    -------
+    dict of int to pycolmap.Reconstruction
+        The models, as written, the largest first.
+
+    Raises
+    ------
+    ColmapVgError
+        The folder or its photographs cannot be used, the output cannot be written, or no model could be made.
+    """
+    options = options or MappingOptions()
+    make_database(image_path, output_path, features, StageLog(on_event), overwrite=options.overwrite)
+    database_path = Path(output_path) / DATABASE_NAME
+    return view_graph_mapping(database_path, image_path, output_path, options, on_event=on_event)
+
+
+def make_database(
+    image_path: str | PathLike[str],
+    output_path: str | PathLike[str],
+    options: FeatureOptions | None = None,
+    log: StageLog | None = None,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+) -> FeatureResult:
+    """Make ``output_path/database.db`` from a folder of photographs.
+
+    Parameters
+    ----------
+    image_path, output_path : path
+    options : FeatureOptions, optional
+    log : StageLog, optional
+    overwrite : bool
+        Replace a database in the output folder that was not made by this function.
+    resume : bool
+        Reuse the finished database, or go on with an unfinished one, when it was made from the same photographs with
+        the same options; otherwise say so, and start afresh.
+
+    Returns
+    -------
+    FeatureResult
+
+    Raises
+    ------
+    ImageFolderError
+        The photographs cannot be used.
+    OutputError
+        The output cannot be written, or holds a database made by something else.
+    """
+    options, log = options or FeatureOptions(), log or StageLog()
+    finished, work = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME
+    record_path, unfinished = work / RECORD_NAME, work / DATABASE_NAME
+    if finished.exists() and not record_path.exists() and not overwrite:
+        raise OutputError(
+            f"{finished} is there already, and colmap-vg did not make it here: map it with "
+            f"`colmap-vg mapper`, choose another --output_path, or replace it with --overwrite"
+        )
+    names, skipped = check_photographs(image_path, options, log)
+    record = _record(image_path, names, options)
+    same = resume and _read_record(record_path) == record
+    if same and finished.exists():
+        log.progress(f"reusing {finished}")
+        known = set(_finished_names(finished))
+        return FeatureResult(tuple(name for name in names if name in known), tuple(skipped), _num_verified(finished))
+    if resume and record_path.exists() and not same:
+        log.warn(f"{work} was made from other photographs or with other options: features are extracted afresh")
+    try:
+        if not same:
+            shutil.rmtree(work, ignore_errors=True)
+            finished.unlink(missing_ok=True)
+        work.mkdir(parents=True, exist_ok=True)
+        record_path.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"cannot write to {work}: {error.strerror}; choose another --output_path") from error
+    names, unreadable = extract_features(image_path, unfinished, names, options, log)
+    num_verified_pairs = match_features(unfinished, options, log)
+    unfinished.replace(finished)
+    return FeatureResult(tuple(names), (*skipped, *unreadable), num_verified_pairs)
+
+
+def _record(image_path: str | PathLike[str], names: list[str], options: FeatureOptions) -> dict[str, object]:
+    """What a database depends on: the files with their sizes and times, and the options but for the threads."""
+    folder = Path(image_path)
+    files = [(name, (folder / name).stat()) for name in names]
+    kept = {key: value for key, value in asdict(options).items() if key not in ("num_threads", "image_list_path")}
+    kept["mask_path"] = None if options.mask_path is None else str(Path(options.mask_path).resolve())
+    record = {
+        "image_path": str(folder.resolve()),
+        "files": [[name, status.st_size, status.st_mtime_ns] for name, status in files],
+        "options": kept,
+    }
+    normal: dict[str, object] = json.loads(json.dumps(record))  # tuples become lists, as in a record that was read
+    return normal
+
+
+def _read_record(path: Path) -> object:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _finished_names(database_path: Path) -> list[str]:
+    return [str(row[0]) for row in _query(database_path, "SELECT name FROM images ORDER BY image_id")]
+
+
+def _num_verified(database_path: Path) -> int:
+    return int(_query(database_path, "SELECT count(*) FROM two_view_geometries WHERE rows > 0")[0][0])
+
+
+def _query(database_path: Path, statement: str) -> list[tuple[str | int, ...]]:
+    """Read without pycolmap, which changes every database that it opens."""
+    connection = sqlite3.connect(f"{database_path.resolve().as_uri()}?mode=ro", uri=True)
+    try:
+        return connection.execute(statement).fetchall()
+    except sqlite3.DatabaseError as error:
+        raise OutputError(f"{database_path} is damaged ({error}): run again without --resume") from error
+    finally:
+        connection.close()
