@@ -1,1 +1,1 @@
-"""Rotation averaging: absolute rotations from relative ones."""
+"""Rotation averaging: spanning tree, chordal optimum with its certificate, robust averaging."""

@@ -1,0 +1,166 @@
+"""Robust rotation averaging: spanning tree, L1, then Geman-McClure, all by reweighted least squares.
+
+Chatterjee & Govindu, "Robust Relative Rotation Averaging" (PAMI 2018). In the tangent space of the world,
+``R_i <- R_i exp(x_i)``, an edge's residual ``r_ij = log(R_j^T R_ij R_i)`` is lowered by ``x_j - x_i``, the same for all
+three axes. Each reweighted step is therefore one scalar graph Laplacian with three right-hand sides.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from colmap_vg.geometry import so3
+from colmap_vg.linear.reweighted import ReweightedLaplacian
+from colmap_vg.robust import geman_mcclure_weight
+from colmap_vg.rotations import quaternions
+from colmap_vg.rotations.problem import RotationResult, checked_initial, checked_problem
+from colmap_vg.rotations.spanning_tree import rotations_from_spanning_tree
+from colmap_vg.solution import LogEntry
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+L1_FLOOR = np.radians(0.5)
+"""Residuals below this count as this in the L1 weights 1/r: the noise of good edges, whose order means nothing."""
+SIGMA_PER_QUARTILE = 2.0
+"""Final Geman-McClure scale over the residuals' lower quartile. For isotropic normal noise the quartile is 1.1 standard
+deviations of an axis, so the loss turns at 2.2. A quartile, because up to half of real edges are outliers."""
+MIN_SIGMA = np.radians(0.1)
+"""Least scale of the last phase; noise-free graphs would have none."""
+L1_TOLERANCE = 3e-3
+"""Step in radians at which L1 gives way to Geman-McClure. Stopped earlier, the end depends on the tree."""
+
+
+def average_rotations_robust(
+    num_images: int,
+    edges: ArrayLike,
+    cam2_from_cam1_rotations: ArrayLike,
+    weights: ArrayLike | None = None,
+    initial: ArrayLike | None = None,
+    *,
+    sigma_deg: float = 5.0,
+    adapt_sigma: bool = True,
+    max_num_l1_iterations: int = 30,
+    max_num_iterations: int = 100,
+    tolerance: float = 1e-4,
+) -> RotationResult:
+    """Rotations that minimise ``sum w_ij rho(r_ij)``, ``rho(r) = r^2 / (1 + r^2 / sigma^2)`` (Geman-McClure).
+
+    Parameters
+    ----------
+    num_images : int
+    edges : (m, 2) int array
+    cam2_from_cam1_rotations : (m, 3, 3) array
+        ``R_ij = R_j R_i^T`` for cam_from_world rotations R.
+    weights : (m,) array, optional
+        Multipliers of the loss; they also choose the spanning tree. Default: all one.
+    initial : (n, 3, 3) array, optional
+        Start in place of the spanning tree.
+    sigma_deg : float
+        Scale of the Geman-McClure loss, degrees; COLMAP's default.
+    adapt_sigma : bool
+        End with a smaller scale, twice the lower quartile of the residuals, where that is below `sigma_deg`.
+    max_num_l1_iterations, max_num_iterations : int
+        Limits of the L1 phase and of each Geman-McClure phase.
+    tolerance : float
+        Root mean square step of the images at which a Geman-McClure phase ends, radians.
+
+    Returns
+    -------
+    RotationResult
+        `cost` is the Geman-McClure objective at the final scale, radians squared.
+
+    Raises
+    ------
+    GraphError
+        The graph is malformed or disconnected.
+    """
+    edges, relative, w = checked_problem(num_images, edges, cam2_from_cam1_rotations, weights)
+    start = checked_initial(num_images, initial)
+    if start is None:
+        start = rotations_from_spanning_tree(num_images, edges, relative, w)
+    if num_images == 1:
+        return RotationResult(start, 0.0, 0, True, ())
+    loop = _Reweighting(num_images, edges, relative, w, start)
+    loop.run(_l1, max_num_l1_iterations, L1_TOLERANCE)
+    loss = _geman_mcclure(np.radians(sigma_deg))
+    converged = loop.run(loss, max_num_iterations, tolerance)
+    if adapt_sigma:
+        sigma = max(MIN_SIGMA, SIGMA_PER_QUARTILE * float(np.quantile(loop.angles, 0.25)))
+        if sigma < np.radians(sigma_deg):
+            loss = _geman_mcclure(sigma)
+            converged = loop.run(loss, max_num_iterations, tolerance)
+    cost = loop.step(loss, relative_tolerance=1e-8)
+    return RotationResult(quaternions.to_matrices(loop.absolute), cost, len(loop.log), converged, tuple(loop.log))
+
+
+def rotation_residuals(edges: IntArray, cam2_from_cam1_rotations: Array, cam_from_world_rotations: Array) -> Array:
+    """Angles between measured and solved relative rotations.
+
+    Parameters
+    ----------
+    edges : (m, 2) int array
+    cam2_from_cam1_rotations : (m, 3, 3) array
+    cam_from_world_rotations : (n, 3, 3) array
+
+    Returns
+    -------
+    (m,) array
+        ``angle(R_ij^T R_j R_i^T)``, radians in [0, pi].
+    """
+    R = cam_from_world_rotations
+    i, j = edges[:, 0], edges[:, 1]
+    return so3.angle(np.swapaxes(R[j], 1, 2) @ cam2_from_cam1_rotations @ R[i])
+
+
+Loss = Callable[[Array], tuple[Array, Array]]
+"""Residuals (m,) in radians to weights (m,) and losses (m,)."""
+
+
+def _l1(r: Array) -> tuple[Array, Array]:
+    return 1.0 / np.maximum(r, L1_FLOOR), r
+
+
+def _geman_mcclure(sigma: float) -> Loss:
+    def loss(r: Array) -> tuple[Array, Array]:
+        s = np.square(r / sigma)
+        return geman_mcclure_weight(s), sigma**2 * s / (1.0 + s)
+
+    return loss
+
+
+class _Reweighting:
+    """Absolute rotations under iteratively reweighted tangent-space steps."""
+
+    def __init__(self, num_images: int, edges: IntArray, relative: Array, weights: Array, start: Array) -> None:
+        self.log: list[LogEntry] = []
+        self.absolute = quaternions.from_matrices(start)
+        self._i, self._j = edges[:, 0], edges[:, 1]
+        self._relative, self._weights = quaternions.from_matrices(relative), weights
+        self._laplacian = ReweightedLaplacian(num_images, edges)
+        self._residuals, self.angles = self._measure()
+
+    def run(self, loss: Loss, max_num_iterations: int, tolerance: float) -> bool:
+        """Iterate until the root mean square step is below the tolerance; whether it was reached."""
+        for _ in range(max_num_iterations):
+            self.step(loss, relative_tolerance=1e-2)
+            if self.log[-1].change <= tolerance:
+                return True
+        return False
+
+    def step(self, loss: Loss, relative_tolerance: float) -> float:
+        """One reweighted least-squares step, its system solved to the given accuracy; the cost after it."""
+        w = self._weights * loss(self.angles)[0]
+        x = self._laplacian.solve(w, self._laplacian.divergence(w * self._residuals), relative_tolerance)
+        self.absolute = quaternions.multiply(self.absolute, quaternions.exp(x.T))
+        self._residuals, self.angles = self._measure()
+        cost = float(self._weights @ loss(self.angles)[1])
+        self.log.append(LogEntry("rotations", len(self.log) + 1, cost, float(np.sqrt(np.mean(x * x) * 3.0))))
+        return cost
+
+    def _measure(self) -> tuple[Array, Array]:
+        """log(R_j^T R_ij R_i) as vectors (3, m) and angles (m,)."""
+        q = self.absolute
+        at_second = quaternions.multiply(quaternions.conjugate(q)[:, self._j], self._relative)
+        return quaternions.log(quaternions.multiply(at_second, q[:, self._i]))
