@@ -42,13 +42,18 @@ class _CholeskyFactor:
 
 
 class _SuperLUFactor:
-    def __init__(self, matrix: sp.csc_array) -> None:
+    def __init__(self, matrix: sp.csc_array, check_definite: bool) -> None:
         try:
             self._factor = spla.splu(
                 matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
             )
         except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
             raise SingularMatrixError(str(error)) from error
+        if check_definite:
+            # Pivots have the signs of the eigenvalues (Sylvester) as long as rows and columns were permuted alike.
+            f = self._factor
+            if not (np.array_equal(f.perm_r, f.perm_c) and (f.U.diagonal() > 0).all()):
+                raise SingularMatrixError("the matrix is not positive definite")
 
     def solve(self, b: Array) -> Array:
         return np.asarray(self._factor.solve(b))
@@ -58,13 +63,15 @@ class SingularMatrixError(GraphError):
     """The system is singular: part of the graph is not fixed by its edges."""
 
 
-def factorize(matrix: sp.csc_array) -> Factor:
+def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
     """Factor a sparse symmetric positive definite matrix.
 
     Parameters
     ----------
     matrix : (n, n) csc_array
         Both triangles stored.
+    check_definite : bool
+        Refuse indefinite matrices on the sparse path too, at the cost of a copy of the factor.
 
     Returns
     -------
@@ -73,10 +80,10 @@ def factorize(matrix: sp.csc_array) -> Factor:
     Raises
     ------
     SingularMatrixError
-        The matrix is not positive definite (dense path) or exactly singular (sparse path).
+        The matrix is not positive definite (dense path, or checked) or exactly singular (sparse path).
     """
     n = matrix.shape[0]
     fill = matrix.nnz / max(1, n * n)
     if n <= DENSE_BELOW or (fill >= DENSE_FILL and n <= DENSE_FILL_LIMIT):
         return _CholeskyFactor(matrix.toarray())
-    return _SuperLUFactor(matrix)
+    return _SuperLUFactor(matrix, check_definite)
