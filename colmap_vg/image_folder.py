@@ -17,13 +17,13 @@ from colmap_vg.errors import OutputError
 from colmap_vg.features.extraction import FeatureResult, check_photographs, extract_features, match_features
 from colmap_vg.mapper import view_graph_mapping
 from colmap_vg.options import FeatureOptions, MappingOptions
+from colmap_vg.output_folder import WORK_NAME, prepare_output
 from colmap_vg.stages import StageEvent, StageLog
 
 if TYPE_CHECKING:
     import pycolmap
 
 DATABASE_NAME = "database.db"
-WORK_NAME = ".work"
 RECORD_NAME = "features.json"
 
 
@@ -81,7 +81,7 @@ def make_database(
     options : FeatureOptions, optional
     log : StageLog, optional
     overwrite : bool
-        Replace a database in the output folder that was not made by this function.
+        Accept an output folder that holds models, and replace a database that was not made by this function.
     resume : bool
         Reuse the finished database, or go on with an unfinished one, when it was made from the same photographs with
         the same options; otherwise say so, and start afresh.
@@ -95,11 +95,12 @@ def make_database(
     ImageFolderError
         The photographs cannot be used.
     OutputError
-        The output cannot be written, or holds a database made by something else.
+        The output cannot be written, or holds models, or a database made by something else.
     """
     options, log = options or FeatureOptions(), log or StageLog()
     finished, work = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME
     record_path, unfinished = work / RECORD_NAME, work / DATABASE_NAME
+    prepare_output(output_path, overwrite)
     if finished.exists() and not record_path.exists() and not overwrite:
         raise OutputError(
             f"{finished} is there already, and colmap-vg did not make it here: map it with "

@@ -291,7 +291,8 @@ def _match(database_path: str | PathLike[str], options: FeatureOptions, log: Sta
         spatial.num_threads = options.num_threads
         pycolmap.match_spatial(database_path, matching, spatial, verification, device)
     with pycolmap.Database.open(database_path) as database:
-        num_matched, num_verified = database.num_matched_image_pairs(), database.num_verified_image_pairs()
+        num_matched = database.num_matched_image_pairs()
+        num_verified = sum(count > 0 for count in database.read_two_view_geometry_num_inliers()[1])
     log.result(f"{num_verified} verified of {num_matched} matched pairs")
     return int(num_verified)
 
