@@ -1,0 +1,134 @@
+"""Algorithm 1 of Nasiri et al.: positions by repeated least squares with the scale factors of the last positions.
+
+* **1C**, displacement error: ``lambda = ||p_j - p_i||``, then LS1, ``min_p sum w ||lambda gamma - (p_j - p_i)||^2``.
+  Its matrix is one scalar Laplacian, factored once for all iterations and axes.
+* **1O**, direction error: ``lambda = 1 / ||p_j - p_i||``, then LS2, ``min_p sum w ||gamma - lambda (p_j - p_i)||^2``
+  (eq. Crs3), a Laplacian with weights ``w lambda^2``, factored in each iteration.
+
+After each iteration the centroid goes to 0 and ``sum ||p||^2`` back to what the start had; nothing else keeps 1C from
+shrinking. The fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C ``sum_j (c d - ||d|| gamma) = 0``,
+with ``d = p_j - p_i`` and c the multiplier of the gauge. Anderson acceleration reaches the same point sooner.
+"""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.linear.anderson import fixed_point
+from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
+from colmap_vg.linear.solvers import Factor, factorize
+from colmap_vg.positions.result import PositionResult, centered, check_connected, spread, unit_weights
+from colmap_vg.solution import LogEntry
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MIN_RELATIVE_LENGTH = 1e-8
+"""Edges shorter than this share of the spread count as this long: direction weights stay finite."""
+
+
+def solve_fixed_point(
+    num_images: int,
+    edges: IntArray,
+    directions_world: Array,
+    initial_centers: Array,
+    approach: Literal["C", "O"],
+    weights: Array | None = None,
+    *,
+    accelerate: bool = True,
+    max_num_iterations: int = 1000,
+    tolerance: float = 1e-10,
+) -> PositionResult:
+    """Alg. 1C or 1O from given positions, usually those of CLS.
+
+    Parameters
+    ----------
+    num_images : int
+    edges : (m, 2) int array
+    directions_world : (m, 3) array
+        Unit ``gamma_ij``, world frame.
+    initial_centers : (n, 3) array
+        Their spread ``sum ||p||^2`` about the centroid is kept.
+    approach : "C" or "O"
+    weights : (m,) array, optional
+        Multipliers of the squared residuals, default 1 (the paper).
+    accelerate : bool
+    max_num_iterations : int
+    tolerance : float
+        On the relative change of positions that one plain iteration makes.
+
+    Returns
+    -------
+    PositionResult
+        `lambdas` are the final lengths ``||p_j - p_i||``; `cost` is eq. CLET for C, eq. CLE1 for O.
+
+    Raises
+    ------
+    GraphError
+        The graph is not connected.
+    """
+    check_connected(num_images, edges)
+    w = unit_weights(weights, len(edges))
+    start = centered(initial_centers)
+    size = spread(start)
+    system = _LaplacianSystem(num_images, edges)
+    fixed_factor = system.factor(w) if approach == "C" else None
+    log: list[LogEntry] = []
+
+    def iterate(p: Array) -> Array:
+        length = _lengths(p, edges, size)
+        if fixed_factor is not None:
+            new = fixed_factor.solve(system.right_side(w * length, directions_world))
+        else:
+            new = system.factor(w / length**2).solve(system.right_side(w / length, directions_world))
+        new = centered(new)
+        return np.asarray(new * (size / spread(new)))
+
+    def note(iteration: int, p: Array, change: float) -> None:
+        log.append(LogEntry("1" + approach, iteration, _cost(p, edges, directions_world, w, approach), change))
+
+    p, count, converged = fixed_point(
+        iterate,
+        start,
+        accelerate=accelerate,
+        max_num_iterations=max_num_iterations,
+        tolerance=tolerance,
+        on_iteration=note,
+    )
+    lengths = np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1)
+    return PositionResult(p, lengths, log[-1].cost, count, converged, tuple(log))
+
+
+class _LaplacianSystem:
+    """Weighted Laplacians of one graph on a fixed pattern."""
+
+    def __init__(self, num_images: int, edges: IntArray) -> None:
+        self._num_images, self._edges = num_images, edges
+        self._pattern = BlockPattern(num_images, edges, 1)
+
+    def factor(self, weights: Array) -> Factor:
+        block = weights[:, None, None]
+        # The mean is free: a damping far below the rounding of the answer makes the matrix definite.
+        damping = np.full((self._num_images, 1, 1), 1e-12 * weights.sum() / self._num_images)
+        return factorize(self._pattern.assemble(block, block, -block, damping))
+
+    def right_side(self, weights: Array, directions: Array) -> Array:
+        pulled = weights[:, None] * directions
+        i, j = self._edges[:, 0], self._edges[:, 1]
+        return sum_at_nodes(self._num_images, j, pulled) - sum_at_nodes(self._num_images, i, pulled)
+
+
+def _lengths(p: Array, edges: IntArray, size: float) -> Array:
+    shortest = MIN_RELATIVE_LENGTH * size / np.sqrt(len(p))
+    return np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
+
+
+def _cost(p: Array, edges: IntArray, directions: Array, w: Array, approach: str) -> float:
+    d = p[edges[:, 1]] - p[edges[:, 0]]
+    length = np.linalg.norm(d, axis=1)
+    residual = length[:, None] * directions - d
+    squared = np.sum(residual**2, axis=1)
+    if approach == "O":
+        squared = squared / np.maximum(length, np.finfo(float).tiny) ** 2
+    return float(np.sum(w * squared))
