@@ -1,0 +1,1 @@
+"""Rotations and positions together: pose-graph optimisation and Algorithm 2."""

@@ -1,0 +1,144 @@
+"""Algorithm 2 of Nasiri et al.: repeated pose-graph optimisation with the scale factors of the last positions.
+
+Each outer iteration sets ``lambda_ij = ||p_j - p_i||`` and solves PS for translations ``lambda_ij gamma^l_ij`` with
+rotation weight 1 and position weight ``w_ij = 1`` (**2C**, displacement error) or ``1 / ||p_j - p_i||^2`` (**2O**, direction
+error); then the centroid goes to 0 and ``sum ||p||^2`` back to what the start had. In 2C that scale is the weight between
+the two terms; 2O does not depend on it.
+
+The inner problem is solved as exactly as the outer change of the moment deserves, so the fixed point is that of exact
+inner solves; Anderson acceleration works on rotation vectors and positions together.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.geometry import so3
+from colmap_vg.joint.pose_graph import PoseGraphProblem
+from colmap_vg.linear.anderson import fixed_point
+from colmap_vg.positions.fixed_point import MIN_RELATIVE_LENGTH
+from colmap_vg.positions.result import centered, spread, unit_weights
+from colmap_vg.solution import LogEntry
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class JointResult:
+    """Rotations and positions solved together.
+
+    Attributes
+    ----------
+    cam_from_world_rotations : (n, 3, 3) array
+    projection_centers : (n, 3) array
+        Centroid 0, spread of the start.
+    cost : float
+        PS's objective at the last scale factors.
+    num_iterations : int
+        Outer ones.
+    converged : bool
+    log : tuple of LogEntry
+    """
+
+    cam_from_world_rotations: Array
+    projection_centers: Array
+    cost: float
+    num_iterations: int
+    converged: bool
+    log: tuple[LogEntry, ...]
+
+
+def solve_joint(
+    num_images: int,
+    edges: IntArray,
+    cam2_from_cam1_rotations: Array,
+    cam2_in_cam1_directions: Array,
+    initial_rotations: Array,
+    initial_centers: Array,
+    approach: Literal["C", "O"],
+    weights: Array | None = None,
+    *,
+    rotation_weights: Array | None = None,
+    accelerate: bool = True,
+    max_num_iterations: int = 1000,
+    tolerance: float = 1e-10,
+) -> JointResult:
+    """Alg. 2C or 2O from given rotations and positions, usually those of RS and CLS.
+
+    Parameters
+    ----------
+    num_images : int
+    edges : (m, 2) int array
+    cam2_from_cam1_rotations : (m, 3, 3) array
+    cam2_in_cam1_directions : (m, 3) array
+        Unit ``gamma^l_ij``, camera 1's frame.
+    initial_rotations : (n, 3, 3) array
+        cam_from_world.
+    initial_centers : (n, 3) array
+    approach : "C" or "O"
+    weights : (m,) array, optional
+        Multipliers of both terms, default 1 (the paper).
+    rotation_weights : (m,) array, optional
+        Further multipliers of the rotation term alone, default 1 (the paper).
+    accelerate : bool
+    max_num_iterations : int
+        Outer iterations.
+    tolerance : float
+        On the relative change of rotations (radians) and positions that one plain outer iteration makes.
+
+    Returns
+    -------
+    JointResult
+
+    Raises
+    ------
+    GraphError
+        The graph is not connected.
+    """
+    problem = PoseGraphProblem(num_images, edges, cam2_from_cam1_rotations)
+    w = unit_weights(weights, len(edges))
+    kappa = w * unit_weights(rotation_weights, len(edges))
+    start_Q, start_p = np.swapaxes(initial_rotations, 1, 2), centered(initial_centers)
+    size = spread(start_p)
+    unit = size / np.sqrt(num_images)
+    shortest = MIN_RELATIVE_LENGTH * unit
+    log: list[LogEntry] = []
+    inner_tolerance, last_cost = 1e-6, np.inf
+
+    def pack(Q: Array, p: Array) -> Array:
+        return np.concatenate([so3.log(Q @ np.swapaxes(start_Q, 1, 2)), p / unit], axis=1)
+
+    def unpack(x: Array) -> tuple[Array, Array]:
+        return so3.exp(x[:, :3]) @ start_Q, x[:, 3:] * unit
+
+    def iterate(x: Array) -> Array:
+        nonlocal last_cost
+        Q, p = unpack(x)
+        length = np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
+        tau = w if approach == "C" else w / length**2
+        translations = length[:, None] * cam2_in_cam1_directions
+        Q, p, inner = problem.solve(Q, p, translations, kappa, tau, tolerance=inner_tolerance)
+        last_cost = inner.cost
+        # The global rotation is free: hold the first camera, so that the iteration has one fixed point.
+        turn = start_Q[0] @ Q[0].T
+        Q, p = turn @ Q, centered(p @ turn.T)
+        return pack(Q, p * (size / spread(p)))
+
+    def note(iteration: int, _: Array, change: float) -> None:
+        nonlocal inner_tolerance
+        inner_tolerance = min(inner_tolerance, max(1e-3 * change, 1e-13))
+        log.append(LogEntry("2" + approach, iteration, last_cost, change))
+
+    x, count, converged = fixed_point(
+        iterate,
+        pack(start_Q, start_p),
+        accelerate=accelerate,
+        max_num_iterations=max_num_iterations,
+        tolerance=tolerance,
+        on_iteration=note,
+    )
+    Q, p = unpack(x)
+    return JointResult(np.swapaxes(Q, 1, 2), p, last_cost, count, converged, tuple(log))
