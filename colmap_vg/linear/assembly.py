@@ -20,7 +20,7 @@ def incidence(num_nodes: int, edges: IntArray) -> sp.csr_array:
 
 def sum_at_nodes(num_nodes: int, nodes: IntArray, values: Array) -> Array:
     """Sum rows of values (m, ...) at nodes (m,): (num_nodes, ...)."""
-    flat = values.reshape(len(nodes), -1)
+    flat = values.reshape(len(nodes), int(np.prod(values.shape[1:])))
     out = np.empty((num_nodes, flat.shape[1]))
     for k in range(flat.shape[1]):
         out[:, k] = np.bincount(nodes, weights=flat[:, k], minlength=num_nodes)

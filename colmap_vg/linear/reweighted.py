@@ -72,7 +72,7 @@ class ReweightedLaplacian:
         b : (n, k) array
             Each column sums to zero.
         relative_tolerance : float
-            Of each column's residual, where the stale factor is used; a new factor solves to rounding.
+            Of the residual's Frobenius norm, where the stale factor serves; a new factor solves to rounding.
 
         Returns
         -------
@@ -93,7 +93,9 @@ class ReweightedLaplacian:
 def conjugate_gradients(
     A: sp.csc_array, b: Array, preconditioner: Factor, relative_tolerance: float, max_iterations: int
 ) -> Array | None:
-    """Preconditioned conjugate gradients on all columns of b at once, or None where the limit is reached.
+    """Preconditioned conjugate gradients, or None where the limit is reached.
+
+    The columns of b share their step lengths, as one long system: turn the rows of b, and the result turns with them.
 
     Parameters
     ----------
@@ -103,29 +105,28 @@ def conjugate_gradients(
     preconditioner : Factor
         Of a matrix near A.
     relative_tolerance : float
-        Each column's residual norm over its norm in b.
+        Frobenius norm of the residual over that of b.
     max_iterations : int
+
+    Returns
+    -------
+    (n, k) array or None
     """
-    goal = relative_tolerance * np.linalg.norm(b, axis=0)
+    goal = relative_tolerance * np.linalg.norm(b)
     x, r = np.zeros_like(b), b.copy()
-    if (np.linalg.norm(r, axis=0) <= goal).all():
+    if np.linalg.norm(r) <= goal:
         return x
     z = preconditioner.solve(r)
-    p, rz = z.copy(), np.einsum("nk,nk->k", r, z)
+    p, rz = z.copy(), np.vdot(r, z)
     for _ in range(max_iterations):
         Ap = A @ p
-        step = rz / _nonzero(np.einsum("nk,nk->k", p, Ap))
+        step = rz / np.vdot(p, Ap)
         x += step * p
         r -= step * Ap
-        if (np.linalg.norm(r, axis=0) <= goal).all():
+        if np.linalg.norm(r) <= goal:
             return x
         z = preconditioner.solve(r)
-        rz_new = np.einsum("nk,nk->k", r, z)
-        p = z + (rz_new / _nonzero(rz)) * p
+        rz_new = np.vdot(r, z)
+        p = z + (rz_new / rz) * p
         rz = rz_new
     return None
-
-
-def _nonzero(values: Array) -> Array:
-    """A column solved exactly has 0 / 0 steps: make them 0."""
-    return np.where(values == 0.0, 1.0, values)

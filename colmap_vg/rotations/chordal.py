@@ -1,10 +1,10 @@
 """Chordal rotation averaging to its optimum (RS of Nasiri et al.): ``min sum w_ij ||R_ij - R_j R_i^T||_F^2``.
 
 The start is spectral: the three leading eigenvectors of the normalised block matrix of relative rotations
-(Arie-Nachimson et al., 3DIMPVT 2012), projected on rotations. From there a Riemannian Newton method: conjugate gradients
-on the exact Hessian, preconditioned by the factored scalar graph Laplacian (the Hessian of consistent rotations), with a
-monotone line search (Nocedal & Wright, Alg. 7.1). Negative curvature ends the inner loop, so saddles that it can see do
-not hold it.
+(Arie-Nachimson et al., 3DIMPVT 2012), projected on rotations. From there a Riemannian Newton method: conjugate
+gradients on the exact Hessian, preconditioned by the factored scalar graph Laplacian (the Hessian of consistent
+rotations), with a monotone line search (Nocedal & Wright, Alg. 7.1). Negative curvature ends the inner loop, so saddles
+that it can see do not hold it.
 """
 
 import numpy as np
