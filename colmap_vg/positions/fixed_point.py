@@ -72,12 +72,12 @@ def solve_fixed_point(
     w = unit_weights(weights, len(edges))
     start = centered(initial_centers)
     size = spread(start)
-    system = _LaplacianSystem(num_images, edges)
+    system = LaplacianSystem(num_images, edges)
     fixed_factor = system.factor(w) if approach == "C" else None
     log: list[LogEntry] = []
 
     def iterate(p: Array) -> Array:
-        length = _lengths(p, edges, size)
+        length = edge_lengths(p, edges, size)
         if fixed_factor is not None:
             new = fixed_factor.solve(system.right_side(w * length, directions_world))
         else:
@@ -100,7 +100,7 @@ def solve_fixed_point(
     return PositionResult(p, lengths, log[-1].cost, count, converged, tuple(log))
 
 
-class _LaplacianSystem:
+class LaplacianSystem:
     """Weighted Laplacians of one graph on a fixed pattern."""
 
     def __init__(self, num_images: int, edges: IntArray) -> None:
@@ -119,7 +119,7 @@ class _LaplacianSystem:
         return sum_at_nodes(self._num_images, j, pulled) - sum_at_nodes(self._num_images, i, pulled)
 
 
-def _lengths(p: Array, edges: IntArray, size: float) -> Array:
+def edge_lengths(p: Array, edges: IntArray, size: float) -> Array:
     shortest = MIN_RELATIVE_LENGTH * size / np.sqrt(len(p))
     return np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
 
