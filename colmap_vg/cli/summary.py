@@ -7,10 +7,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, is_dataclass
 from enum import Enum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from colmap_vg._version import __version__
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.errors import OutputError
+
+if TYPE_CHECKING:
+    import pycolmap
 
 FILE_NAME = "summary.json"
 
@@ -48,6 +52,19 @@ def edge_summary(verdicts: Iterable[str], kept: Iterable[bool]) -> dict[str, obj
         "num_edges": len(rows),
         "num_kept": len(rows) - dropped.total(),
         "dropped": dict(dropped.most_common()),
+    }
+
+
+def model_summary(path: Path, model: "pycolmap.Reconstruction") -> dict[str, object]:
+    """Size and fit of a model."""
+    model.update_point_3d_errors()  # the mean below reads stored errors
+    return {
+        "path": str(path),
+        "num_images": model.num_reg_images(),
+        "num_points": model.num_points3D(),
+        "num_observations": model.compute_num_observations(),
+        "mean_track_length": model.compute_mean_track_length(),
+        "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
     }
 
 
