@@ -207,3 +207,25 @@ def test_spatial_matching_without_positions_is_refused(tmp_path: Path, corner: C
     corner.write(tmp_path / "images")
     with pytest.raises(ImageFolderError, match="GPS position"):
         extract_and_match(tmp_path / "images", tmp_path / "a.db", FeatureOptions(matching="spatial", **QUICK))
+
+
+def test_portrait_and_landscape_match_with_cameras_of_their_own(tmp_path: Path, corner: Corner) -> None:
+    corner.write(tmp_path / "images")
+    write_jpeg(tmp_path / "images" / "01.jpg", np.ascontiguousarray(np.rot90(corner.images[1])))
+    extract_and_match(tmp_path / "images", tmp_path / "a.db", FeatureOptions(num_threads=2, max_num_features=1500))
+    with pycolmap.Database.open(tmp_path / "a.db") as database:
+        cameras = {image.name: database.read_camera(image.camera_id) for image in database.read_all_images()}
+        assert database.read_two_view_geometry(1, 2).inlier_matches.shape[0] > 30
+        assert database.read_two_view_geometry(2, 3).inlier_matches.shape[0] > 30
+    assert (cameras["01.jpg"].width, cameras["01.jpg"].height) == (HEIGHT, WIDTH)
+    assert (cameras["00.jpg"].width, cameras["00.jpg"].height) == (WIDTH, HEIGHT)
+
+
+def test_sequential_matching_pairs_neighbours_only(tmp_path: Path, corner: Corner) -> None:
+    corner.write(tmp_path / "images")
+    options = FeatureOptions(matching="sequential", sequential_overlap=1, **QUICK)
+    extract_and_match(tmp_path / "images", tmp_path / "a.db", options)
+    with pycolmap.Database.open(tmp_path / "a.db") as database:
+        assert database.exists_matches(1, 2)
+        assert database.exists_matches(2, 3)
+        assert not database.exists_matches(1, 3)
