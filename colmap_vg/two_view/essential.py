@@ -1,0 +1,184 @@
+"""Essential and fundamental matrices of all edges: conversion, Sampson errors, and the pose that cheirality chooses.
+
+With ``cam2_from_cam1 = (R, t)`` a match obeys ``x2^T E x1 = 0``, ``E = [t]_x R = -R [d]_x``, where
+``d = -R^T t`` is the direction of camera 2's centre in camera 1's frame (Hartley & Zisserman, Multiple View Geometry, §9.6).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.geometry import so3
+from colmap_vg.geometry.directions import angle_between
+from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_subset, segment_sums
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePoses:
+    """Relative poses of m edges and how their matches lie to them.
+
+    Attributes
+    ----------
+    rotations : (m, 3, 3) array
+        cam2_from_cam1 rotations.
+    directions : (m, 3) array
+        Unit directions of camera 2's centre in camera 1's frame.
+    num_in_front : (m,) int64 array
+        Matches whose rays meet in front of both cameras.
+    share_in_front : (m,) array
+        The same over all matches of the edge; 0 for edges without matches.
+    median_angles : (m,) array
+        Median angle between the two rays of the matches in front, radians; 0 where there are none.
+    """
+
+    rotations: Array
+    directions: Array
+    num_in_front: IntArray
+    share_in_front: Array
+    median_angles: Array
+
+
+def essential_from_pose(rotations: Array, directions: Array) -> Array:
+    """``E = -R [d]_x`` of relative rotations (m, 3, 3) and directions (m, 3), both singular values 1: (m, 3, 3)."""
+    return np.asarray(-rotations @ so3.hat(directions))
+
+
+def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
+    """``E = K2^T F K1``, of unit Frobenius norm; the singular values are left as they are.
+
+    Parameters
+    ----------
+    F : (m, 3, 3) array
+        Fundamental matrices on pixels, ``x2^T F x1 = 0``.
+    K1, K2 : (m, 3, 3) or (3, 3) array
+        Calibration matrices.
+
+    Returns
+    -------
+    (m, 3, 3) array
+    """
+    E = np.swapaxes(K2, -1, -2) @ F @ K1
+    norm = np.linalg.norm(E, axis=(-2, -1), keepdims=True)
+    return np.asarray(E / np.where(norm > 0, norm, 1.0))
+
+
+def nearest_essential(M: Array) -> Array:
+    """Nearest essential matrices with singular values (1, 1, 0), in the Frobenius norm up to scale: (m, 3, 3)."""
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U[..., :, :2] @ Vt[..., :2, :])
+
+
+def sampson_errors(
+    E: Array,
+    offsets: IntArray,
+    bearings1: Array,
+    bearings2: Array,
+    focal_lengths1: Array | None = None,
+    focal_lengths2: Array | None = None,
+) -> Array:
+    """Signed first-order distance of each match from its epipolar constraint, on the unit sphere.
+
+    ``x2^T E x1 / sqrt(|P1 E^T x2|^2 / f1^2 + |P2 E x1|^2 / f2^2)`` with ``P = I - x x^T`` the projection on the tangent
+    plane of a bearing, so that it serves lenses of any field of view.
+
+    Parameters
+    ----------
+    E : (m, 3, 3) array
+        Essential matrices, of any scale.
+    offsets : (m + 1,) int array
+    bearings1, bearings2 : (k, 3) array
+        Unit rays.
+    focal_lengths1, focal_lengths2 : (m,) array, optional
+        Focal lengths of each edge's cameras in pixels.
+
+    Returns
+    -------
+    (k,) array
+        Radians, or pixels when focal lengths are given. Zero for a match on both epipoles.
+    """
+    edge = segment_of_rows(offsets)
+    row_E = E[edge]
+    line2 = np.einsum("kij,kj->ki", row_E, bearings1)
+    line1 = np.einsum("kij,ki->kj", row_E, bearings2)
+    algebraic = np.einsum("ki,ki->k", bearings2, line2)
+    squared = np.square(algebraic)
+    variance1 = np.einsum("ki,ki->k", line1, line1) - squared
+    variance2 = np.einsum("ki,ki->k", line2, line2) - squared
+    if focal_lengths1 is not None:
+        variance1 = variance1 / np.square(focal_lengths1)[edge]
+    if focal_lengths2 is not None:
+        variance2 = variance2 / np.square(focal_lengths2)[edge]
+    variance = variance1 + variance2
+    good = variance > 0
+    return np.asarray(np.where(good, algebraic / np.sqrt(np.where(good, variance, 1.0)), 0.0))
+
+
+def in_front_of_both(
+    rotations: Array, directions: Array, offsets: IntArray, bearings1: Array, bearings2: Array
+) -> BoolArray:
+    """Whether the rays of each match meet (in least squares) in front of both cameras: (k,).
+
+    The depths that minimise ``|l1 R x1 + t - l2 x2|`` have the signs of ``c (b.t) - a.t`` and ``b.t - c (a.t)``, with
+    ``a = R x1``, ``b = x2``, ``c = a.b``.
+    """
+    edge = segment_of_rows(offsets)
+    a = np.einsum("kij,kj->ki", rotations[edge], bearings1)
+    t = -np.einsum("mij,mj->mi", rotations, directions)[edge]
+    along1, along2 = np.einsum("ki,ki->k", a, t), np.einsum("ki,ki->k", bearings2, t)
+    cosine = np.einsum("ki,ki->k", a, bearings2)
+    return np.asarray((cosine * along2 > along1) & (along2 > cosine * along1))
+
+
+def judged_poses(
+    rotations: Array, directions: Array, offsets: IntArray, bearings1: Array, bearings2: Array
+) -> RelativePoses:
+    """Given relative poses (m, 3, 3), (m, 3) with their cheirality counts and triangulation angles."""
+    edge = segment_of_rows(offsets)
+    front = in_front_of_both(rotations, directions, offsets, bearings1, bearings2)
+    num = segment_sums(offsets, front.astype(np.float64)).astype(np.int64)
+    turned = np.einsum("kij,kj->ki", rotations[edge[front]], bearings1[front])
+    angles = segment_quantiles(segment_subset(offsets, front), angle_between(turned, bearings2[front]))
+    share = num / np.maximum(np.diff(offsets), 1)
+    return RelativePoses(rotations, directions, num, share, np.where(num > 0, np.nan_to_num(angles), 0.0))
+
+
+def poses_from_essential(E: Array, offsets: IntArray, bearings1: Array, bearings2: Array) -> RelativePoses:
+    """Of the four poses of each essential matrix, the one that most matches lie in front of.
+
+    Hartley & Zisserman §9.6.2. Ties (edges without matches, too) go to the first candidate.
+
+    Parameters
+    ----------
+    E : (m, 3, 3) array
+        Essential matrices of any scale and sign; unequal singular values are made equal.
+    offsets : (m + 1,) int array
+    bearings1, bearings2 : (k, 3) array
+        Unit rays of the matches.
+
+    Returns
+    -------
+    RelativePoses
+    """
+    U, _, Vt = np.linalg.svd(E)
+    U = U * np.sign(np.linalg.det(U))[:, None, None]
+    Vt = Vt * np.sign(np.linalg.det(Vt))[:, None, None]
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    # E is free of t's sign, and the null vector of E is the direction itself whichever of the rotations is taken.
+    rotation_pair = (U @ quarter @ Vt, U @ quarter.T @ Vt)
+    direction = Vt[:, 2, :]
+    candidates = [(R, s * direction) for R in rotation_pair for s in (1.0, -1.0)]
+    votes = np.stack(
+        [
+            segment_sums(offsets, in_front_of_both(R, d, offsets, bearings1, bearings2).astype(np.float64))
+            for R, d in candidates
+        ]
+    )
+    best, rows = np.argmax(votes, axis=0), np.arange(len(E))
+    R = np.stack([c[0] for c in candidates])[best, rows]
+    d = np.stack([c[1] for c in candidates])[best, rows]
+    return judged_poses(R, d, offsets, bearings1, bearings2)

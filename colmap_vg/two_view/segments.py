@@ -1,0 +1,63 @@
+"""Sums and medians over the segments of a concatenated array, without a loop over segments.
+
+Segment k is rows ``offsets[k]:offsets[k + 1]``; segments may be empty.
+"""
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def segment_of_rows(offsets: IntArray) -> IntArray:
+    """Segment of each row: (m + 1,) offsets to (k,)."""
+    return np.repeat(np.arange(len(offsets) - 1, dtype=np.int64), np.diff(offsets))
+
+
+def segment_sums(offsets: IntArray, values: Array, weights: Array | None = None) -> Array:
+    """Sums of (weighted) rows within each segment; empty segments give zero.
+
+    Parameters
+    ----------
+    offsets : (m + 1,) int array
+    values : (k, ...) array
+    weights : (k,) array, optional
+        One where missing.
+
+    Returns
+    -------
+    (m, ...) array
+    """
+    k = len(values)
+    data = np.ones(k) if weights is None else weights
+    # A product with a sparse indicator matrix: one pass in C, whatever the row length, and empty segments are right.
+    select = sp.csr_array((data, np.arange(k), offsets), shape=(len(offsets) - 1, k))
+    width = int(np.prod(values.shape[1:], dtype=np.int64))
+    return np.asarray(select @ values.reshape(k, width)).reshape(len(offsets) - 1, *values.shape[1:])
+
+
+def segment_quantiles(offsets: IntArray, values: Array, quantile: float = 0.5) -> Array:
+    """Quantiles of (k,) values within each segment, interpolated as ``np.quantile`` does; NaN where empty: (m,)."""
+    order = np.lexsort((values, segment_of_rows(offsets)))
+    ordered = np.append(values[order], np.nan)
+    count = np.diff(offsets)
+    place = quantile * np.maximum(count - 1, 0)
+    low = np.floor(place).astype(np.int64)
+    share = place - low
+    start = np.where(count > 0, offsets[:-1] + low, len(values))
+    follow = np.where(share > 0, start + 1, start)
+    return np.asarray((1.0 - share) * ordered[start] + share * ordered[follow])
+
+
+def segment_subset(offsets: IntArray, keep: NDArray[np.bool_]) -> IntArray:
+    """Offsets (m + 1,) of the rows that are kept, for a mask (k,) over the rows."""
+    return np.concatenate([[0], np.cumsum(keep)])[offsets].astype(np.int64)
+
+
+def rows_of_segments(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows of some segments in order, and their new offsets: (m + 1,), (s,) to (k',), (s + 1,)."""
+    count = np.diff(offsets)[chosen]
+    subset = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    return np.arange(subset[-1]) + np.repeat(offsets[:-1][chosen] - subset[:-1], count), subset
