@@ -1,9 +1,9 @@
 """Algorithm 2 of Nasiri et al.: repeated pose-graph optimisation with the scale factors of the last positions.
 
 Each outer iteration sets ``lambda_ij = ||p_j - p_i||`` and solves PS for translations ``lambda_ij gamma^l_ij`` with
-rotation weight 1 and position weight ``w_ij = 1`` (**2C**, displacement error) or ``1 / ||p_j - p_i||^2`` (**2O**, direction
-error); then the centroid goes to 0 and ``sum ||p||^2`` back to what the start had. In 2C that scale is the weight between
-the two terms; 2O does not depend on it.
+rotation weight 1 and position weight ``w_ij = 1`` (**2C**, displacement error) or ``1 / ||p_j - p_i||^2`` (**2O**,
+direction error); then the centroid goes to 0 and ``sum ||p||^2`` back to what the start had. In 2C that scale is the
+weight between the two terms; 2O does not depend on it.
 
 The inner problem is solved as exactly as the outer change of the moment deserves, so the fixed point is that of exact
 inner solves; Anderson acceleration works on rotation vectors and positions together.

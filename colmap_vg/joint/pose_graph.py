@@ -1,7 +1,7 @@
 """PS: pose-graph optimisation on SE(3), rotations and positions in one least-squares problem (eq. PGO).
 
-With ``Q_i`` camera to world (``cam_from_world`` transposed) and ``t_ij`` the measured translation from camera i to camera
-j in camera i's frame::
+With ``Q_i`` camera to world (``cam_from_world`` transposed) and ``t_ij`` the measured translation from camera i to
+camera j in camera i's frame::
 
     min  sum kappa_ij ||R_ij - Q_j^T Q_i||_F^2 + tau_ij ||Q_i t_ij - (p_j - p_i)||^2
 

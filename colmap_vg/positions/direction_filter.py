@@ -61,7 +61,7 @@ def robust_direction_residuals(
 
 def _chordal(p: Array, edges: IntArray, directions: Array, size: float) -> Array:
     d = p[edges[:, 1]] - p[edges[:, 0]]
-    return np.linalg.norm(directions - d / edge_lengths(p, edges, size)[:, None], axis=1)
+    return np.asarray(np.linalg.norm(directions - d / edge_lengths(p, edges, size)[:, None], axis=1))
 
 
 def _direction_step(

@@ -6,8 +6,8 @@
   (eq. Crs3), a Laplacian with weights ``w lambda^2``, factored in each iteration.
 
 After each iteration the centroid goes to 0 and ``sum ||p||^2`` back to what the start had; nothing else keeps 1C from
-shrinking. The fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C ``sum_j (c d - ||d|| gamma) = 0``,
-with ``d = p_j - p_i`` and c the multiplier of the gauge. Anderson acceleration reaches the same point sooner.
+shrinking. The fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C
+``sum_j (c d - ||d|| gamma) = 0``, with ``d = p_j - p_i`` and c the multiplier of the gauge. Anderson acceleration reaches the same point sooner.
 """
 
 from typing import Literal
@@ -121,7 +121,7 @@ class LaplacianSystem:
 
 def edge_lengths(p: Array, edges: IntArray, size: float) -> Array:
     shortest = MIN_RELATIVE_LENGTH * size / np.sqrt(len(p))
-    return np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
+    return np.asarray(np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest))
 
 
 def _cost(p: Array, edges: IntArray, directions: Array, w: Array, approach: str) -> float:

@@ -49,8 +49,8 @@ def check_connected(num_images: int, edges: IntArray) -> None:
     if num_images and component.max() > 0:
         row = int(np.flatnonzero(component)[0])
         raise GraphError(
-            f"positions need a connected graph: image row {row} is not linked to the {int((component == 0).sum())} images"
-            " of the largest component; solve the components one by one"
+            f"positions need a connected graph: image row {row} is not linked to the"
+            f" {int((component == 0).sum())} images of the largest component; solve the components one by one"
         )
 
 
