@@ -7,7 +7,8 @@
 
 After each iteration the centroid goes to 0 and ``sum ||p||^2`` back to what the start had; nothing else keeps 1C from
 shrinking. The fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C
-``sum_j (c d - ||d|| gamma) = 0``, with ``d = p_j - p_i`` and c the multiplier of the gauge. Anderson acceleration reaches the same point sooner.
+``sum_j (c d - ||d|| gamma) = 0``, with ``d = p_j - p_i`` and c the multiplier of the gauge. Anderson acceleration
+reaches the same point sooner.
 """
 
 from typing import Literal
