@@ -1,0 +1,152 @@
+"""The whole chain on graphs whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from colmap_vg import (
+    EdgeVerdict,
+    ImageVerdict,
+    SolutionStatus,
+    SolveOptions,
+    ViewGraph,
+    align_positions,
+    solve_view_graph,
+)
+from colmap_vg.geometry import so3
+from colmap_vg.synthetic import ring_scene
+
+PAPER = {"rotation_averaging": "chordal", "rotation_gate_deg": 0.0, "outlier_filter": "none"}
+METHODS = ["1C", "1O", "2C", "2O"]
+
+
+def _errors(solution, scene):
+    r = solution.registered
+    return align_positions(solution.projection_centers[r], scene.projection_centers[r])[0]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("front", [{}, PAPER])
+def test_noise_free_graphs_are_recovered(method, front):
+    scene = ring_scene(25, 6, seed=3)
+    solution = solve_view_graph(scene.graph, SolveOptions(method=method, convergence_tolerance=1e-12, **front))
+    assert solution.status == SolutionStatus.SOLVED
+    spread = np.sqrt(np.mean(np.sum((scene.projection_centers - scene.projection_centers.mean(0)) ** 2, axis=1)))
+    assert _errors(solution, scene).max() / spread < 1e-8
+    turn = np.swapaxes(solution.cam_from_world_rotations, 1, 2) @ scene.cam_from_world_rotations
+    assert so3.angle(turn @ turn[0].T).max() < 1e-8
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_outliers_leave_with_a_verdict_and_positions_stay_right(method):
+    scene = ring_scene(100, 10, rotation_sigma=0.004, direction_sigma=0.02, outlier_share=0.25, seed=1)
+    solution = solve_view_graph(scene.graph, SolveOptions(method=method))
+    assert not (solution.edge_kept & scene.outlier).any()
+    assert (~solution.edge_kept & ~scene.outlier).sum() <= 0.01 * (~scene.outlier).sum()
+    dropped = {EdgeVerdict.ROTATION_OUTLIER, EdgeVerdict.DIRECTION_OUTLIER, EdgeVerdict.OUTSIDE}
+    assert set(solution.edge_verdicts[~solution.edge_kept]) <= dropped
+    assert _errors(solution, scene).max() < 0.1 * 4.0
+
+
+def test_the_paper_s_own_front_removes_outliers_by_1dsfm():
+    scene = ring_scene(100, 10, rotation_sigma=0.004, direction_sigma=0.02, seed=1)
+    graph = scene.graph
+    wrong = np.zeros(graph.num_edges, dtype=bool)
+    wrong[::12] = True
+    directions = graph.cam2_in_cam1_directions.copy()
+    directions[wrong] *= -1.0
+    graph = replace(graph, cam2_in_cam1_directions=directions)
+    options = SolveOptions(method="1C", rotation_averaging="chordal", rotation_gate_deg=0.0, outlier_filter="1dsfm")
+    solution = solve_view_graph(graph, options)
+    dropped = solution.edge_verdicts == EdgeVerdict.ONE_DSFM
+    assert dropped[wrong].mean() > 0.6
+    assert dropped[~wrong].mean() < 0.1
+
+
+def test_images_outside_are_left_out_with_their_reason():
+    scene = ring_scene(20, 4)
+    g = scene.graph
+    n = g.num_images
+
+    def edge_to(row):
+        return np.array([[0, row]])
+
+    # Image n hangs on one edge, n + 1 and n + 2 are a pair of their own, n + 3 has nothing.
+    edges = np.concatenate([g.edges, edge_to(n), np.array([[n + 1, n + 2]])])
+    graph = ViewGraph(
+        np.arange(10, 10 + n + 4),
+        edges,
+        np.concatenate([g.cam2_from_cam1_rotations, np.tile(np.eye(3), (2, 1, 1))]),
+        np.concatenate([g.cam2_in_cam1_directions, np.tile([0.0, 0.0, 1.0], (2, 1))]),
+    )
+    solution = solve_view_graph(graph, SolveOptions(method="1O"))
+    assert solution.status == SolutionStatus.PARTIAL
+    assert solution.image_verdicts[:n].tolist() == [ImageVerdict.REGISTERED] * n
+    assert solution.image_verdicts[n:].tolist() == [
+        ImageVerdict.NOT_RIGID,
+        ImageVerdict.SMALLER_COMPONENT,
+        ImageVerdict.SMALLER_COMPONENT,
+        ImageVerdict.NO_EDGES,
+    ]
+    assert np.isnan(solution.projection_centers[n:]).all()
+    assert solution.component.tolist() == [0] * n + [-1] * 4
+    assert solution.edge_verdicts[-2:].tolist() == [EdgeVerdict.OUTSIDE] * 2
+    assert "4 of 24" in solution.message
+
+
+@pytest.mark.parametrize("edges", [[], [(0, 1)], [(0, 1), (2, 3)]])
+def test_graphs_that_fix_nothing_are_unsolvable_and_say_so(edges):
+    m = len(edges)
+    graph = ViewGraph(
+        np.arange(4),
+        np.array(edges, dtype=int).reshape(m, 2),
+        np.tile(np.eye(3), (m, 1, 1)),
+        np.tile([0.0, 0.0, 1.0], (m, 1)),
+    )
+    solution = solve_view_graph(graph)
+    assert solution.status == SolutionStatus.UNSOLVABLE
+    assert not solution.registered.any()
+    assert "overlapping" in solution.message
+
+
+def test_edges_refused_on_reading_are_not_used():
+    scene = ring_scene(20, 6)
+    words = np.full(scene.graph.num_edges, EdgeVerdict.KEPT, dtype=object)
+    words[::5] = EdgeVerdict.WATERMARK
+    directions = scene.graph.cam2_in_cam1_directions.copy()
+    directions[::5] = [0.0, 0.0, 1.0]
+    graph = replace(scene.graph, read_verdicts=words.astype(str), cam2_in_cam1_directions=directions)
+    solution = solve_view_graph(graph, SolveOptions(method="1O"))
+    assert (solution.edge_verdicts[::5] == EdgeVerdict.WATERMARK).all()
+    assert _errors(solution, scene).max() < 1e-4
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_neither_the_world_nor_the_order_of_images_and_edges_matters(seed):
+    rng = np.random.default_rng(seed)
+    scene = ring_scene(15, 5, rotation_sigma=0.01, direction_sigma=0.03, seed=7)
+    g = scene.graph
+    images, edges = rng.permutation(g.num_images), rng.permutation(g.num_edges)
+    new_row = np.argsort(images)
+    shuffled = ViewGraph(
+        g.image_ids[images],
+        new_row[g.edges[edges]],
+        g.cam2_from_cam1_rotations[edges],
+        g.cam2_in_cam1_directions[edges],
+        num_inliers=g.num_inliers[edges],
+    )
+    options = SolveOptions(method="2O", convergence_tolerance=1e-9)
+    a, b = solve_view_graph(g, options), solve_view_graph(shuffled, options)
+    errors, _ = align_positions(b.projection_centers[new_row], a.projection_centers)
+    assert errors.max() < 1e-5
+
+
+def test_same_bits_again():
+    scene = ring_scene(30, 6, rotation_sigma=0.01, direction_sigma=0.03, outlier_share=0.1)
+    a, b = solve_view_graph(scene.graph), solve_view_graph(scene.graph)
+    assert a.projection_centers.tobytes() == b.projection_centers.tobytes()
+    assert a.cam_from_world_rotations.tobytes() == b.cam_from_world_rotations.tobytes()
