@@ -141,7 +141,7 @@ def _spectral_start(num_images: int, edges: IntArray, weights: Array, W: sp.bsr_
     degree = np.bincount(edges[:, 0], weights, num_images) + np.bincount(edges[:, 1], weights, num_images)
     scale = sp.diags_array(np.repeat(1.0 / np.sqrt(degree), 3))
     normalized = sp.csc_array(sp.eye_array(3 * num_images) - scale @ W.tocsr() @ scale)
-    _, vectors = smallest_eigenpairs(normalized, 3, lower_bound=0.0)
+    _, vectors = smallest_eigenpairs(normalized, 3, tolerance=1e-3)  # a start: Newton does the rest
     blocks = vectors.reshape(num_images, 3, 3)
     # Eigenvectors come with a common orthogonal factor of either sign; rotations want the one of positive determinant.
     if np.sum(np.sign(np.linalg.det(blocks))) < 0:

@@ -88,8 +88,8 @@ def test_smallest_eigenpairs(path, below, monkeypatch):
     edges, weights = _ring(n, rng, reach=20)
     A = sp.csc_array(laplacian(n, edges, weights) - sp.diags_array(below * (rng.random(n) < 0.1)))
     if path == "lanczos":
-        monkeypatch.setattr(eigen, "DENSE_FILL_LIMIT", 10)
-        monkeypatch.setattr(eigen, "DENSE_FILL", 0.0)
+        monkeypatch.setattr(eigen, "FACTOR_LIMIT", 10)
+        monkeypatch.setattr(eigen, "DENSE_ROW", 10)
     values, vectors = smallest_eigenpairs(A, 3)
     expected = np.linalg.eigvalsh(A.toarray())
     scale = np.abs(expected).max()
