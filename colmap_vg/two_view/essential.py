@@ -1,7 +1,8 @@
 """Essential and fundamental matrices of all edges: conversion, Sampson errors, and the pose that cheirality chooses.
 
 With ``cam2_from_cam1 = (R, t)`` a match obeys ``x2^T E x1 = 0``, ``E = [t]_x R = -R [d]_x``, where
-``d = -R^T t`` is the direction of camera 2's centre in camera 1's frame (Hartley & Zisserman, Multiple View Geometry, §9.6).
+``d = -R^T t`` is the direction of camera 2's centre in camera 1's frame (Hartley & Zisserman, Multiple View Geometry,
+§9.6).
 """
 
 from dataclasses import dataclass

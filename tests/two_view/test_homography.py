@@ -30,8 +30,7 @@ def test_true_pose_is_one_of_the_two_and_both_reproduce_the_homography(seed, sca
     assert (found.median_errors < 1e-9).all()
 
 
-@pytest.mark.real_data
-def test_decompositions_are_opencvs(data_folder):
+def test_decompositions_are_opencvs():
     cv2 = pytest.importorskip("cv2")
     data = matched_rays(5, [40] * 20, planar=True)
     found = poses_from_homography(data.homographies, data.offsets, data.bearings1, data.bearings2)

@@ -1,0 +1,180 @@
+"""Essential and fundamental matrices of all edges from their matches alone, by robust linear estimation.
+
+The eight-point algorithm on the 9x9 moments ``M = sum w (x2 ⊗ x1)(x2 ⊗ x1)^T`` of each edge. The products of
+``x1 x1^T`` and ``x2 x2^T`` are 6 x 6 = 36 numbers a match, which do not change while weights do. Normalisation (Hartley,
+In defense of the eight-point algorithm, 1997) is a whitening of each side, applied to the moments instead of the points. Weights
+are those of the Sampson distance times a Cauchy weight, as in iteratively reweighted algebraic fitting (Hartley &
+Zisserman §11.4.3).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.robust import cauchy_weight
+from colmap_vg.two_view.essential import nearest_essential
+from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_sums
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # position of entry (i, j) among the six distinct ones
+_ROWS, _COLUMNS = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
+_MIN_MATCHES = 8
+
+
+def pair_products(points1: Array, points2: Array) -> Array:
+    """The 36 distinct products of ``x2 x2^T`` and ``x1 x1^T`` of each match: (k, 3), (k, 3) to (k, 36)."""
+    first = points1[:, _ROWS] * points1[:, _COLUMNS]
+    second = points2[:, _ROWS] * points2[:, _COLUMNS]
+    return np.asarray((second[:, :, None] * first[:, None, :]).reshape(len(points1), 36))
+
+
+def moments_from_products(products: Array) -> Array:
+    """Moment matrices on the row-major ``vec(E)`` from summed products: (m, 36) to (m, 9, 9)."""
+    second = _SYMMETRIC[:, None, :, None]
+    first = _SYMMETRIC[None, :, None, :]
+    return np.asarray(products[:, 6 * second + first].reshape(len(products), 9, 9))
+
+
+def matrix_of_least_moment(moments: Array) -> Array:
+    """Matrices of unit norm that minimise ``vec(E)^T M vec(E)`` after whitening both sides: (m, 9, 9) to (m, 3, 3)."""
+    by_side = moments.reshape(-1, 3, 3, 3, 3)
+    whiten2 = _inverse_root(np.einsum("mijkj->mik", by_side))
+    whiten1 = _inverse_root(np.einsum("mijil->mjl", by_side))
+    both = np.einsum("mik,mjl->mijkl", whiten2, whiten1).reshape(-1, 9, 9)
+    # (W2 x2)^T E' (W1 x1) = x2^T (W2 E' W1) x1, W symmetric.
+    _, vectors = np.linalg.eigh(both @ moments @ both)
+    E = whiten2 @ vectors[:, :, 0].reshape(-1, 3, 3) @ whiten1
+    return np.asarray(E / np.linalg.norm(E, axis=(1, 2), keepdims=True))
+
+
+def estimate_essential_from_inliers(
+    offsets: IntArray,
+    bearings1: Array,
+    bearings2: Array,
+    initial: Array | None = None,
+    *,
+    num_iterations: int = 10,
+    min_scale: float = 2e-4,
+) -> Array:
+    """Robust essential matrix of each edge from its matches, with or without a matrix to start from.
+
+    Meant for verified matches: from nothing it bears a few percent of gross outliers (at 5 % the rotations of 9 edges
+    in 10 came out within 0.1°), from a given matrix far more.
+
+    Parameters
+    ----------
+    offsets : (m + 1,) int array
+    bearings1, bearings2 : (k, 3) array
+        Unit rays.
+    initial : (m, 3, 3) array, optional
+        Essential matrices that give the first weights; equal weights where missing.
+    num_iterations : int
+        Reweighting rounds.
+    min_scale : float
+        Floor of the Cauchy scale, radians; above it the scale is twice the median error.
+
+    Returns
+    -------
+    (m, 3, 3) array
+        Singular values (1, 1, 0). NaN for edges with fewer than eight matches, unless they have an `initial`, which
+        they then keep.
+    """
+    return _reweighted(offsets, bearings1, bearings2, initial, num_iterations, min_scale, on_sphere=True)
+
+
+def estimate_fundamental_from_inliers(
+    offsets: IntArray,
+    points1: Array,
+    points2: Array,
+    initial: Array | None = None,
+    *,
+    num_iterations: int = 10,
+    min_scale: float = 0.3,
+) -> Array:
+    """Robust fundamental matrix of each edge from its matches in pixels.
+
+    Parameters
+    ----------
+    offsets : (m + 1,) int array
+    points1, points2 : (k, 2) array
+        Matched keypoints, pixels.
+    initial : (m, 3, 3) array, optional
+        As for :func:`estimate_essential_from_inliers`.
+    num_iterations : int
+    min_scale : float
+        Floor of the Cauchy scale, pixels.
+
+    Returns
+    -------
+    (m, 3, 3) array
+        Rank two, unit norm, ``x2^T F x1 = 0``; NaN or `initial` for edges with fewer than eight matches.
+    """
+    # Pixels reach 1e4, their products 1e16: bring all points to about 1 first, one scale for all edges.
+    size = max(float(np.abs(points1).max(initial=1.0)), float(np.abs(points2).max(initial=1.0)))
+    shrink = np.diag([1.0 / size, 1.0 / size, 1.0])
+    grow = np.diag([size, size, 1.0])
+    plane1, plane2 = (np.concatenate([p / size, np.ones((len(p), 1))], axis=1) for p in (points1, points2))
+    start = None if initial is None else grow @ initial @ grow
+    F = shrink @ _reweighted(offsets, plane1, plane2, start, num_iterations, min_scale / size, on_sphere=False) @ shrink
+    return np.asarray(F / np.linalg.norm(F, axis=(1, 2), keepdims=True))
+
+
+def _reweighted(
+    offsets: IntArray,
+    points1: Array,
+    points2: Array,
+    initial: Array | None,
+    num_iterations: int,
+    min_scale: float,
+    *,
+    on_sphere: bool,
+) -> Array:
+    m = len(offsets) - 1
+    result = np.full((m, 3, 3), np.nan) if initial is None else initial.astype(np.float64)
+    enough = np.diff(offsets) >= _MIN_MATCHES
+    edge = segment_of_rows(offsets)
+    products = pair_products(points1, points2)
+    weights = np.ones(len(products))
+    E = np.where(enough[:, None, None], np.nan_to_num(result), np.eye(3))
+    if initial is not None:
+        weights = _sampson_weights(E, offsets, edge, points1, points2, min_scale, on_sphere)
+    for iteration in range(num_iterations):
+        moments = moments_from_products(segment_sums(offsets, products, weights))
+        moments[~enough] = np.eye(9)
+        E = _rank_two(matrix_of_least_moment(moments), on_sphere)
+        if iteration + 1 < num_iterations:
+            weights = _sampson_weights(E, offsets, edge, points1, points2, min_scale, on_sphere)
+    result[enough] = E[enough]
+    return result
+
+
+def _sampson_weights(
+    E: Array, offsets: IntArray, edge: IntArray, points1: Array, points2: Array, min_scale: float, on_sphere: bool
+) -> Array:
+    row_E = E[edge]
+    line2 = np.einsum("kij,kj->ki", row_E, points1)
+    line1 = np.einsum("kij,ki->kj", row_E, points2)
+    algebraic = np.einsum("ki,ki->k", points2, line2)
+    variance = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1)
+    if on_sphere:
+        variance += np.square(line1[:, 2]) + np.square(line2[:, 2]) - 2.0 * np.square(algebraic)
+    # A match beside both epipoles fits whatever its error: without a floor its weight would grow beyond all others.
+    typical = segment_sums(offsets, variance) / np.maximum(np.diff(offsets), 1)
+    variance = np.maximum(variance, 1e-2 * typical[edge] + 1e-300)
+    squared = np.square(algebraic) / variance
+    scale = np.maximum(2.0 * np.sqrt(segment_quantiles(offsets, squared)), min_scale)
+    return np.asarray(cauchy_weight(squared / np.square(scale[edge])) / variance)
+
+
+def _rank_two(E: Array, on_sphere: bool) -> Array:
+    if on_sphere:
+        return nearest_essential(E)
+    U, s, Vt = np.linalg.svd(E)
+    return np.asarray((U[:, :, :2] * s[:, None, :2]) @ Vt[:, :2, :])
+
+
+def _inverse_root(C: Array) -> Array:
+    values, vectors = np.linalg.eigh(C)
+    values = np.maximum(values, 1e-12 * values[:, -1:] + 1e-300)
+    return np.asarray((vectors / np.sqrt(values)[:, None, :]) @ np.swapaxes(vectors, 1, 2))
