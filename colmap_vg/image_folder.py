@@ -17,7 +17,7 @@ from colmap_vg.errors import OutputError
 from colmap_vg.features.extraction import FeatureResult, check_photographs, extract_features, match_features
 from colmap_vg.mapper import view_graph_mapping
 from colmap_vg.options import FeatureOptions, MappingOptions
-from colmap_vg.output_folder import WORK_NAME, prepare_output
+from colmap_vg.output_folder import WORK_NAME, prepare_output, refuse_models
 from colmap_vg.stages import StageEvent, StageLog
 
 if TYPE_CHECKING:
@@ -100,18 +100,19 @@ def make_database(
     options, log = options or FeatureOptions(), log or StageLog()
     finished, work = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME
     record_path, unfinished = work / RECORD_NAME, work / DATABASE_NAME
-    prepare_output(output_path, overwrite)
+    refuse_models(output_path, overwrite)
     if finished.exists() and not record_path.exists() and not overwrite:
         raise OutputError(
             f"{finished} is there already, and colmap-vg did not make it here: map it with "
             f"`colmap-vg mapper`, choose another --output_path, or replace it with --overwrite"
         )
     names, skipped = check_photographs(image_path, options, log)
+    prepare_output(output_path, overwrite)
     record = _record(image_path, names, options)
     same = resume and _read_record(record_path) == record
     if same and finished.exists():
         log.progress(f"reusing {finished}")
-        known = set(_finished_names(finished))
+        known = set(image_names(finished))
         return FeatureResult(tuple(name for name in names if name in known), tuple(skipped), _num_verified(finished))
     if resume and record_path.exists() and not same:
         log.warn(f"{work} was made from other photographs or with other options: features are extracted afresh")
@@ -151,7 +152,14 @@ def _read_record(path: Path) -> object:
         return None
 
 
-def _finished_names(database_path: Path) -> list[str]:
+def image_names(database_path: Path) -> list[str]:
+    """Names of a database's images by id, read without changing the file.
+
+    Raises
+    ------
+    OutputError
+        The file is damaged.
+    """
     return [str(row[0]) for row in _query(database_path, "SELECT name FROM images ORDER BY image_id")]
 
 
@@ -161,7 +169,9 @@ def _num_verified(database_path: Path) -> int:
 
 def _query(database_path: Path, statement: str) -> list[tuple[str | int, ...]]:
     """Read without pycolmap, which changes every database that it opens."""
-    connection = sqlite3.connect(f"{database_path.resolve().as_uri()}?mode=ro", uri=True)
+    # Without "immutable", reading a database in COLMAP's WAL mode leaves -wal and -shm files beside it.
+    mode = "mode=ro" if Path(f"{database_path}-wal").exists() else "mode=ro&immutable=1"
+    connection = sqlite3.connect(f"{database_path.resolve().as_uri()}?{mode}", uri=True)
     try:
         return connection.execute(statement).fetchall()
     except sqlite3.DatabaseError as error:

@@ -39,12 +39,7 @@ def prepare_output(output_path: str | PathLike[str], overwrite: bool = False) ->
     """
     output, work = Path(output_path), Path(output_path) / WORK_NAME
     try:
-        models = existing_models(output)
-        if models and not overwrite:
-            raise OutputError(
-                f"{output} already holds a model ({models[0]}): choose another --output_path, or replace it with "
-                "--overwrite"
-            )
+        refuse_models(output, overwrite)
         work.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=work) as probe:
             probe.write(b"\0")
@@ -53,6 +48,16 @@ def prepare_output(output_path: str | PathLike[str], overwrite: bool = False) ->
             f"cannot write to the output folder {output}: {error.strerror}; choose another --output_path"
         ) from error
     return work
+
+
+def refuse_models(output_path: str | PathLike[str], overwrite: bool = False) -> None:
+    """Raise `OutputError` when the folder holds a model that must not be overwritten; nothing is created."""
+    models = existing_models(output_path)
+    if models and not overwrite:
+        raise OutputError(
+            f"{output_path} already holds a model ({models[0]}): choose another --output_path, or replace it with "
+            "--overwrite"
+        )
 
 
 def existing_models(output_path: str | PathLike[str]) -> list[Path]:

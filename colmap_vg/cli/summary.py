@@ -24,7 +24,7 @@ def job_summary(verb: str, options: Mapping[str, object], reporter: Reporter) ->
     return {
         "verb": verb,
         "version": __version__,
-        "options": {name: _plain(value) for name, value in options.items()},
+        "options": {name: plain(value) for name, value in options.items()},
         "stages": [asdict(record) for record in reporter.records],
         "seconds": sum(record.seconds for record in reporter.records),
         "peak_memory_mib": max((record.peak_memory_mib for record in reporter.records), default=0.0),
@@ -84,16 +84,16 @@ def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
         raise OutputError(f"cannot write {output_path / FILE_NAME}: {error.strerror}") from error
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> object:
     """The value in JSON's types."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {name: _plain(item) for name, item in asdict(value).items()}
+        return {name: plain(item) for name, item in asdict(value).items()}
     if isinstance(value, Mapping):
-        return {str(name): _plain(item) for name, item in value.items()}
+        return {str(name): plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, Enum):
-        return _plain(value.value)
+        return plain(value.value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return os.fspath(value) if isinstance(value, os.PathLike) else str(value)

@@ -139,10 +139,10 @@ def _require_enough(num_images: int, image_path: str | PathLike[str], skipped: S
     if num_images >= MIN_IMAGES:
         return
     found = f"{num_images} photograph{'' if num_images == 1 else 's'}" if num_images else "no photograph"
-    reasons = f" ({len(skipped)} files were skipped, the first is {skipped[0].name}: {skipped[0].reason})"
-    raise ImageFolderError(
-        f"{image_path} holds {found} that can be used; a model needs at least {MIN_IMAGES}{reasons if skipped else ''}"
-    )
+    reasons = ""
+    if skipped:
+        reasons = f" ({len(skipped)} files were skipped, the first is {skipped[0].name}: {skipped[0].reason})"
+    raise ImageFolderError(f"{image_path} holds {found} that can be used; a model needs at least {MIN_IMAGES}{reasons}")
 
 
 def _reader_options(options: FeatureOptions) -> pycolmap.ImageReaderOptions:

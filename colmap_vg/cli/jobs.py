@@ -1,0 +1,149 @@
+"""What the verbs do: the library's jobs, with their results shown and written to ``summary.json``."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pycolmap
+
+from colmap_vg.cli.reporter import Reporter
+from colmap_vg.cli.summary import edge_summary, image_summary, job_summary, model_summary, plain, write_summary
+from colmap_vg.errors import MappingError
+from colmap_vg.image_folder import DATABASE_NAME, image_names, make_database
+from colmap_vg.mapper import view_graph_mapping
+from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.output_folder import prepare_output, publish_models
+from colmap_vg.stages import StageLog
+
+
+def configure_colmap_log(verbose: bool) -> None:
+    """Keep COLMAP's own log off standard error, where the one line of an error belongs."""
+    level = pycolmap.logging.Level.INFO if verbose else pycolmap.logging.Level.FATAL
+    pycolmap.logging.minloglevel = level.value
+
+
+def run(
+    image_path: Path,
+    output_path: Path,
+    features: FeatureOptions,
+    options: MappingOptions,
+    resume: bool,
+    reporter: Reporter,
+) -> None:
+    """From a folder of photographs to models."""
+    configure_colmap_log(reporter.verbose)
+    log = StageLog(reporter.on_event)
+    result = make_database(image_path, output_path, features, log, overwrite=options.overwrite, resume=resume)
+    database_path = output_path / DATABASE_NAME
+    models = view_graph_mapping(database_path, image_path, output_path, options, on_event=reporter.on_event)
+    asked = {"image_path": image_path, "output_path": output_path, "features": features, "mapping": options}
+    skipped = {file.name: file.reason for file in result.skipped}
+    _finish("run", {**asked, "resume": resume}, database_path, models, output_path, reporter, skipped)
+
+
+def mapper(
+    database_path: Path,
+    image_path: Path | None,
+    output_path: Path,
+    options: MappingOptions,
+    resume: bool,
+    reporter: Reporter,
+) -> None:
+    """From a database to models."""
+    configure_colmap_log(reporter.verbose)
+    models = view_graph_mapping(database_path, image_path, output_path, options, on_event=reporter.on_event)
+    asked = {"database_path": database_path, "image_path": image_path, "output_path": output_path, "mapping": options}
+    _finish("mapper", {**asked, "resume": resume}, database_path, models, output_path, reporter, {})
+
+
+def solve(
+    database_path: Path,
+    output_path: Path,
+    read: ReadOptions,
+    options: SolveOptions,
+    overwrite: bool,
+    resume: bool,
+    reporter: Reporter,
+) -> None:
+    """The viewing graph only: a model of poses without points."""
+    from colmap_vg.colmap_io.read import read_view_graph
+    from colmap_vg.colmap_io.reconstruction import reconstruction_from_solution
+    from colmap_vg.solve import solve_view_graph
+
+    configure_colmap_log(reporter.verbose)
+    log = StageLog(reporter.on_event)
+    work = prepare_output(output_path, overwrite)
+    with log.stage("view graph"):
+        graph = read_view_graph(database_path, read)
+        log.result(f"{len(graph.image_ids)} images, {len(graph.edges)} edges")
+    with log.stage("solve"):
+        solution = solve_view_graph(graph, options)
+        log.result(solution.message)
+    if not solution.registered.any():
+        raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")
+    with log.stage("write"):
+        staged = work / "0"
+        staged.mkdir(exist_ok=True)
+        reconstruction_from_solution(database_path, solution, graph).write(staged)
+        publish_models([staged], output_path)
+        log.result(str(output_path / "0"))
+    asked = {"database_path": database_path, "output_path": output_path, "read": read, "solve": options}
+    content = job_summary("solve", {**asked, "overwrite": overwrite, "resume": resume}, reporter)
+    names = graph.image_names or tuple(str(image_id) for image_id in graph.image_ids)
+    content["status"] = str(solution.status)
+    content["images"] = image_summary(names, solution.image_verdicts.tolist(), solution.registered.tolist())
+    content["edges"] = edge_summary(solution.edge_verdicts.tolist(), solution.edge_kept.tolist())
+    write_summary(output_path, content)
+    reporter.say(f"{int(solution.registered.sum())} of {len(names)} images registered: {output_path / '0'}")
+
+
+def demo(
+    output_path: Path,
+    num_images: int,
+    seed: int,
+    num_threads: int,
+    overwrite: bool,
+    resume: bool,
+    reporter: Reporter,
+) -> None:
+    """Render a scene, run it, and compare with the truth."""
+    from colmap_vg.demo import run_demo
+
+    configure_colmap_log(reporter.verbose)
+    comparison = run_demo(
+        output_path,
+        num_images=num_images,
+        seed=seed,
+        num_threads=num_threads,
+        overwrite=overwrite,
+        on_event=reporter.on_event,
+    )
+    asked = {"output_path": output_path, "num_images": num_images, "seed": seed, "num_threads": num_threads}
+    content = job_summary("demo", {**asked, "overwrite": overwrite, "resume": resume}, reporter)
+    write_summary(output_path, {**content, "comparison": plain(comparison)})
+
+
+def _finish(
+    verb: str,
+    asked: Mapping[str, object],
+    database_path: Path,
+    models: Mapping[int, pycolmap.Reconstruction],
+    output_path: Path,
+    reporter: Reporter,
+    skipped: Mapping[str, str],
+) -> None:
+    """Write the summary of a mapping job, and say what came out."""
+    names = image_names(database_path)
+    registered = {image.name for model in models.values() for image in model.images.values() if image.has_pose}
+    verdicts = ["registered" if name in registered else "left_out" for name in names]
+    content = job_summary(verb, asked, reporter)
+    content["images"] = image_summary(
+        [*names, *skipped],
+        [*verdicts, *skipped.values()],
+        [*(name in registered for name in names), *[False] * len(skipped)],
+    )
+    content["models"] = [model_summary(output_path / str(index), model) for index, model in models.items()]
+    write_summary(output_path, content)
+    for index, model in models.items():
+        size = f"{model.num_reg_images()} of {len(names)} images, {model.num_points3D()} points"
+        error = f"mean reprojection error {model.compute_mean_reprojection_error():.2f} px"
+        reporter.say(f"{output_path / str(index)}: {size}, {error}")
