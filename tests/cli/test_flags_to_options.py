@@ -1,0 +1,138 @@
+"""Each flag reaches the option that it stands for, under every name that it has."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+import colmap_vg.cli
+from colmap_vg.cli.main import app
+from colmap_vg.errors import MappingError
+from colmap_vg.options import FeatureOptions, MappingOptions, SolveOptions
+
+
+class Jobs(SimpleNamespace):
+    """Stands in for `colmap_vg.cli.jobs`, and keeps what it is called with."""
+
+    def run(self, *arguments: object) -> None:
+        self.called = arguments
+
+    mapper = solve = demo = run
+
+
+@pytest.fixture
+def jobs(monkeypatch: pytest.MonkeyPatch) -> Jobs:
+    jobs = Jobs()
+    monkeypatch.setitem(sys.modules, "colmap_vg.cli.jobs", jobs)
+    monkeypatch.setattr(colmap_vg.cli, "jobs", jobs, raising=False)
+    return jobs
+
+
+def called(jobs: Jobs, *arguments: str) -> tuple[object, ...]:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    found: tuple[object, ...] = jobs.called
+    return found
+
+
+def mapping(jobs: Jobs, *flags: str) -> MappingOptions:
+    options = called(jobs, "mapper", "--database_path", "d", "--output_path", "o", *flags)[3]
+    assert isinstance(options, MappingOptions)
+    return options
+
+
+def test_no_flags_are_the_librarys_defaults(jobs: Jobs) -> None:
+    assert mapping(jobs) == MappingOptions()
+    image_path, output_path, features, options, resume, _ = called(
+        jobs, "run", "--image_path", "i", "--output_path", "o"
+    )
+    assert (image_path, output_path, resume) == (Path("i"), Path("o"), False)
+    assert features == FeatureOptions()
+    assert options == MappingOptions()
+    assert called(jobs, "solve", "--database_path", "d", "--output_path", "o")[3] == SolveOptions()
+
+
+@pytest.mark.parametrize("prefix", ["--", "--Mapper.", "--GlobalMapper."])
+def test_refinement_flags(jobs: Jobs, prefix: str) -> None:
+    options = mapping(jobs, f"{prefix}ba_refine_focal_length", "0")
+    assert not options.ba_refine_focal_length
+    assert options.solve.refine_focal_lengths == "never"
+    assert mapping(jobs, f"{prefix}ba_refine_principal_point=true").ba_refine_principal_point
+    assert not mapping(jobs, f"{prefix}ba_refine_extra_params", "False").ba_refine_extra_params
+
+
+def test_glomaps_refinement_flags(jobs: Jobs) -> None:
+    options = mapping(jobs, "--BundleAdjustment.optimize_intrinsics", "0")
+    assert not options.ba_refine_focal_length
+    assert not options.ba_refine_extra_params
+    assert mapping(jobs, "--BundleAdjustment.optimize_principal_point", "1").ba_refine_principal_point
+
+
+@pytest.mark.parametrize("prefix", ["--", "--Mapper.", "--GlobalMapper."])
+def test_threads_seed_and_matches_reach_every_stage(jobs: Jobs, prefix: str) -> None:
+    options = mapping(jobs, f"{prefix}num_threads", "3", f"{prefix}random_seed", "7", f"{prefix}min_num_matches", "20")
+    assert options.num_threads == options.read.num_threads == 3
+    assert options.random_seed == options.read.random_seed == options.solve.random_seed == 7
+    assert options.read.min_num_inliers == 20
+    assert mapping(jobs, f"{prefix}random_seed", "-1").random_seed == 0
+
+
+def test_solver_flags(jobs: Jobs) -> None:
+    flags = ("--method", "2C", "--rotation_averaging", "chordal", "--outlier_filter", "1dsfm", "--edge_weights", "unit")
+    options = mapping(jobs, *flags, "--rotation_gate_deg", "0", "--Mapper.extract_colors", "0", "--overwrite")
+    expected = SolveOptions(
+        method="2C", rotation_averaging="chordal", outlier_filter="1dsfm", edge_weights="unit", rotation_gate_deg=0.0
+    )
+    assert options.solve == expected
+    assert not options.extract_colors
+    assert options.overwrite
+    assert mapping(jobs, "--GlobalMapper.ra_max_rotation_error_deg", "5").solve.rotation_gate_deg == 5.0
+    assert mapping(jobs, "--trust_focal_lengths", "never").read.trust_focal_lengths == "never"
+
+
+def test_feature_flags(jobs: Jobs) -> None:
+    flags = ("--camera_model", "PINHOLE", "--camera_params", "1,2.5,3,4", "--camera_mode", "single")
+    more = (
+        "--matching",
+        "sequential",
+        "--mask_path",
+        "m",
+        "--image_list_path",
+        "l",
+        "--max_num_features",
+        "99",
+        "--resume",
+    )
+    arguments = called(jobs, "run", "--image_path", "i", "--output_path", "o", *flags, *more)
+    assert arguments[2] == FeatureOptions(
+        camera_model="PINHOLE",
+        camera_params=(1.0, 2.5, 3.0, 4.0),
+        camera_mode="single",
+        matching="sequential",
+        mask_path=Path("m"),
+        image_list_path=Path("l"),
+        max_num_features=99,
+    )
+    assert arguments[4] is True
+
+
+def test_demo_flags(jobs: Jobs) -> None:
+    assert called(jobs, "demo", "--output_path", "o")[:3] == (Path("o"), 24, 0)
+    assert called(jobs, "demo", "--output_path", "o", "--num_images", "6", "--seed", "5")[:3] == (Path("o"), 6, 5)
+
+
+def test_ends_of_a_job_become_exit_codes(jobs: Jobs, monkeypatch: pytest.MonkeyPatch) -> None:
+    def end_with(error: BaseException) -> tuple[int, str]:
+        def job(*_: object) -> None:
+            raise error
+
+        monkeypatch.setattr(jobs, "solve", job, raising=False)
+        result = CliRunner().invoke(app, ["solve", "--database_path", "d", "--output_path", "o"])
+        return result.exit_code, result.stderr
+
+    assert end_with(MappingError("no model\ncould be made")) == (1, "error: no model could be made\n")
+    code, line = end_with(KeyboardInterrupt())
+    assert code == 130
+    assert line.startswith("interrupted")
