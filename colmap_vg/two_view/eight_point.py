@@ -1,10 +1,10 @@
 """Essential and fundamental matrices of all edges from their matches alone, by robust linear estimation.
 
 The eight-point algorithm on the 9x9 moments ``M = sum w (x2 ⊗ x1)(x2 ⊗ x1)^T`` of each edge. The products of
-``x1 x1^T`` and ``x2 x2^T`` are 6 x 6 = 36 numbers a match, which do not change while weights do. Normalisation (Hartley,
-In defense of the eight-point algorithm, 1997) is a whitening of each side, applied to the moments instead of the points. Weights
-are those of the Sampson distance times a Cauchy weight, as in iteratively reweighted algebraic fitting (Hartley &
-Zisserman §11.4.3).
+``x1 x1^T`` and ``x2 x2^T`` are 6 x 6 = 36 numbers a match, which do not change while weights do. Normalisation
+(Hartley, In defense of the eight-point algorithm, 1997) is a whitening of each side, applied to the moments instead of
+the points. Weights are those of the Sampson distance times a Cauchy weight, as in iteratively reweighted algebraic
+fitting (Hartley & Zisserman §11.4.3).
 """
 
 import numpy as np
