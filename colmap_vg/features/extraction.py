@@ -22,7 +22,7 @@ from colmap_vg.stages import StageLog
 MIN_IMAGES = 3
 """Images; two views have no redundancy that could tell a right model from a wrong one."""
 
-IMAGES_PER_CALL = 16
+IMAGES_PER_CALL = 8
 """Images per thread and call of pycolmap: progress is told between calls, and a call ends with idle threads."""
 
 
