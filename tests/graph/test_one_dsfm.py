@@ -111,6 +111,15 @@ def test_lines_follow_the_density_of_the_edges():
     assert np.mean(projection_directions(flat, 500, rng, heavy)[:, 0] ** 2) > 0.7
 
 
+def test_the_density_is_not_much_wider_than_the_edges():
+    """Directions within 0.1 of one axis: the kernel adds (1 + m^(-2/7))^(1/2) = 1.06 to the spread, not more."""
+    rng = np.random.default_rng(0)
+    directions = normalized(np.array([0.0, 0.0, 1.0]) + 0.1 * rng.standard_normal((2000, 3)) * [1.0, 1.0, 0.0])
+    lines = projection_directions(directions, 4000, rng)
+    slope = np.abs(lines[:, :2] / lines[:, 2:])
+    assert 0.9 < np.median(slope) / (0.0675 * 1.06) < 1.1  # the median of |N(0, 0.1)| is 0.0675
+
+
 def test_seed_decides():
     edges, directions = _random_graph(20, 100, np.random.default_rng(0))
     a, b, c = (one_dsfm_broken_weights(20, edges, directions, seed=s) for s in (1, 1, 2))

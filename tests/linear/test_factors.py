@@ -79,6 +79,18 @@ def test_conjugate_gradients_turn_with_the_right_hand_side():
     assert np.array_equal(conjugate_gradients(A, 0 * b, near, 1e-3, 1), 0 * b)
 
 
+def test_conjugate_gradients_end_in_as_many_steps_as_there_are_eigenvalues():
+    rng = np.random.default_rng(5)
+    basis = np.linalg.qr(rng.standard_normal((60, 60)))[0]
+    A = sp.csc_array(basis @ np.diag(np.repeat([1.0, 3.0, 10.0, 30.0], 15)) @ basis.T)
+    b = rng.standard_normal((60, 1))
+    plain = factorize(sp.csc_array(sp.eye_array(60)))
+    x = conjugate_gradients(A, b, plain, 1e-9, 4)
+    assert x is not None
+    assert np.allclose(A @ x, b, atol=1e-7)
+    assert conjugate_gradients(A, b, plain, 1e-9, 3) is None
+
+
 @pytest.mark.parametrize("path", ["all", "shifted", "lanczos"])
 @pytest.mark.parametrize("below", [0.0, 0.5, 20.0])
 def test_smallest_eigenpairs(path, below, monkeypatch):

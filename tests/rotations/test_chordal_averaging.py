@@ -56,6 +56,8 @@ def test_cost_gradient_and_hessian_against_finite_differences():
 
     h = 1e-4
     assert np.sum(model.gradient * v) == pytest.approx((along(h) - along(-h)) / (2 * h), rel=1e-6)
+    u = rng.standard_normal((7, 3))
+    assert np.sum(model.hessian_times(v) * u) == pytest.approx(np.sum(model.hessian_times(u) * v), rel=1e-12)
     second = (along(h) - 2 * along(0.0) + along(-h)) / h**2
     assert np.sum(model.hessian_times(v) * v) == pytest.approx(second, rel=1e-5)
 
@@ -70,12 +72,13 @@ def test_the_optimum_is_scipys():
     assert result.cost <= found.fun * (1 + 1e-12)
 
 
-def test_gradient_vanishes_and_cost_falls_monotonically():
-    edges, relative, weights, _ = _problem(60, 2, sigma=0.3)
-    start = so3.random(60, np.random.default_rng(4))
-    for initial in (None, start):
-        result = average_rotations_chordal(60, edges, relative, weights, initial)
-        W = chordal_matrix(60, edges, relative, weights)
+@pytest.mark.parametrize("seed", range(20))
+def test_gradient_vanishes_and_cost_falls_monotonically(seed):
+    """From random starts on very noisy graphs, where full steps raise the cost in about every sixth run."""
+    edges, relative, weights, _ = _problem(20, seed, sigma=1.0)
+    for initial in (None, so3.random(20, np.random.default_rng(seed))):
+        result = average_rotations_chordal(20, edges, relative, weights, initial)
+        W = chordal_matrix(20, edges, relative, weights)
         assert np.abs(TangentQuadratic(W, result.cam_from_world_rotations).gradient).max() < 1e-10
         costs = np.array([entry.cost for entry in result.log])
         assert (np.diff(costs) <= 1e-13 * costs[:-1]).all()
