@@ -11,7 +11,7 @@ from colmap_vg.errors import MappingError
 from colmap_vg.image_folder import DATABASE_NAME, image_names, make_database
 from colmap_vg.mapper import view_graph_mapping
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
-from colmap_vg.output_folder import prepare_output, publish_models
+from colmap_vg.output_folder import prepare_output, publish_models, refuse_models
 from colmap_vg.stages import StageLog
 
 
@@ -71,7 +71,7 @@ def solve(
 
     configure_colmap_log(reporter.verbose)
     log = StageLog(reporter.on_event)
-    work = prepare_output(output_path, overwrite)
+    refuse_models(output_path, overwrite)
     with log.stage("view graph"):
         graph = read_view_graph(database_path, read)
         log.result(f"{len(graph.image_ids)} images, {len(graph.edges)} edges")
@@ -81,7 +81,7 @@ def solve(
     if not solution.registered.any():
         raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")
     with log.stage("write"):
-        staged = work / "0"
+        staged = prepare_output(output_path, overwrite) / "0"
         staged.mkdir(exist_ok=True)
         reconstruction_from_solution(database_path, solution, graph).write(staged)
         publish_models([staged], output_path)
