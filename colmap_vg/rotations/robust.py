@@ -23,13 +23,15 @@ IntArray = NDArray[np.int64]
 
 L1_FLOOR = np.radians(0.5)
 """Residuals below this count as this in the L1 weights 1/r: the noise of good edges, whose order means nothing."""
-SIGMA_PER_QUARTILE = 2.0
+SIGMA_PER_QUARTILE = 2.3
 """Final Geman-McClure scale over the residuals' lower quartile. For isotropic normal noise the quartile is 1.1 standard
-deviations of an axis, so the loss turns at 2.2. A quartile, because up to half of real edges are outliers."""
+deviations of an axis, so the loss turns at 2.5. A quartile, because up to half of real edges are outliers."""
 MIN_SIGMA = np.radians(0.1)
 """Least scale of the last phase; noise-free graphs would have none."""
 L1_TOLERANCE = 3e-3
 """Step in radians at which L1 gives way to Geman-McClure. Stopped earlier, the end depends on the tree."""
+FIRST_TOLERANCE = 1e-3
+"""Step in radians at which the scale is adapted; COLMAP's last tolerance."""
 
 
 def average_rotations_robust(
@@ -60,7 +62,7 @@ def average_rotations_robust(
     sigma_deg : float
         Scale of the Geman-McClure loss, degrees; COLMAP's default.
     adapt_sigma : bool
-        End with a smaller scale, twice the lower quartile of the residuals, where that is below `sigma_deg`.
+        End with a smaller scale, 2.3 times the lower quartile of the residuals, where that is below `sigma_deg`.
     max_num_l1_iterations, max_num_iterations : int
         Limits of the L1 phase and of each Geman-McClure phase.
     tolerance : float
@@ -85,12 +87,11 @@ def average_rotations_robust(
     loop = _Reweighting(num_images, edges, relative, w, start)
     loop.run(_l1, max_num_l1_iterations, L1_TOLERANCE)
     loss = _geman_mcclure(np.radians(sigma_deg))
-    converged = loop.run(loss, max_num_iterations, tolerance)
+    converged = loop.run(loss, max_num_iterations, max(tolerance, FIRST_TOLERANCE) if adapt_sigma else tolerance)
     if adapt_sigma:
         sigma = max(MIN_SIGMA, SIGMA_PER_QUARTILE * float(np.quantile(loop.angles, 0.25)))
-        if sigma < np.radians(sigma_deg):
-            loss = _geman_mcclure(sigma)
-            converged = loop.run(loss, max_num_iterations, tolerance)
+        loss = _geman_mcclure(min(sigma, np.radians(sigma_deg)))
+        converged = loop.run(loss, max_num_iterations, tolerance)
     cost = loop.step(loss, relative_tolerance=1e-8)
     return RotationResult(quaternions.to_matrices(loop.absolute), cost, len(loop.log), converged, tuple(loop.log))
 
