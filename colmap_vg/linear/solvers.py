@@ -63,7 +63,7 @@ class SingularMatrixError(GraphError):
     """The system is singular: part of the graph is not fixed by its edges."""
 
 
-def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
+def factorize(matrix: sp.csc_array, *, check_definite: bool = False, in_loop: bool = False) -> Factor:
     """Factor a sparse symmetric positive definite matrix.
 
     Parameters
@@ -72,6 +72,9 @@ def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
         Both triangles stored.
     check_definite : bool
         Refuse indefinite matrices on the sparse path too, at the cost of a copy of the factor.
+    in_loop : bool
+        The factor is one of many of middling size: SuperLU above `DENSE_BELOW` whatever the fill. LAPACK's threads wait
+        for each other at every call, which on a busy machine cost eight times SuperLU's time (627 full rows).
 
     Returns
     -------
@@ -84,6 +87,6 @@ def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
     """
     n = matrix.shape[0]
     fill = matrix.nnz / max(1, n * n)
-    if n <= DENSE_BELOW or (fill >= DENSE_FILL and n <= DENSE_FILL_LIMIT):
+    if n <= DENSE_BELOW or (not in_loop and fill >= DENSE_FILL and n <= DENSE_FILL_LIMIT):
         return _CholeskyFactor(matrix.toarray())
     return _SuperLUFactor(matrix, check_definite)
