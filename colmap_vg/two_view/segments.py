@@ -61,3 +61,15 @@ def rows_of_segments(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, Int
     count = np.diff(offsets)[chosen]
     subset = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
     return np.arange(subset[-1]) + np.repeat(offsets[:-1][chosen] - subset[:-1], count), subset
+
+
+def evenly_thinned(offsets: IntArray, limit: int) -> NDArray[np.bool_]:
+    """Rows that thin each segment to at most `limit` of them, evenly over its order: (k,); all rows where limit is 0."""
+    counts = np.diff(offsets)
+    if limit == 0 or (counts <= limit).all():
+        return np.ones(int(offsets[-1]), dtype=bool)
+    segment = segment_of_rows(offsets)
+    rank = np.arange(len(segment)) - offsets[:-1][segment]
+    kept = np.minimum(counts, limit)[segment]
+    # Row r of c stays where floor(r kept / c) rises: just `kept` rows.
+    return np.asarray((rank * kept) // counts[segment] != ((rank - 1) * kept) // counts[segment])

@@ -1,0 +1,75 @@
+"""COLMAP cameras: unit rays of keypoints, calibration matrices, other focal lengths."""
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.geometry.directions import normalized
+
+Array = NDArray[np.float64]
+
+MAX_REPROJECTION_PX = 0.5
+"""A ray that does not project back on its keypoint is wrong: some models return such rays beyond their field of view."""
+
+
+def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Unit rays of pixels in the camera's frame.
+
+    Parameters
+    ----------
+    camera : pycolmap.Camera
+    points : (k, 2) array
+        Pixels.
+
+    Returns
+    -------
+    bearings : (k, 3) array
+        The optical axis where the camera model has no ray.
+    valid : (k,) bool array
+        Rays in front of the camera that project back on their pixels.
+    """
+    points = np.ascontiguousarray(points, dtype=float)
+    rays = np.ones((len(points), 3))
+    if len(points) == 0:
+        return rays, np.zeros(0, dtype=bool)
+    rays[:, :2] = camera.cam_from_img(points)
+    valid = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
+    rays[~valid] = (0.0, 0.0, 1.0)
+    if not camera.is_undistorted():
+        again = camera.img_from_cam(rays)
+        with np.errstate(invalid="ignore"):
+            valid &= np.abs(again - points).max(axis=1) <= MAX_REPROJECTION_PX
+    return normalized(rays), valid
+
+
+def calibration_matrix(camera: "pycolmap.Camera", focal_scale: float = 1.0) -> Array:
+    """Calibration matrix (3, 3) with the focal lengths multiplied by a factor."""
+    K = np.array(camera.calibration_matrix(), dtype=float)
+    K[0, 0] *= focal_scale
+    K[1, 1] *= focal_scale
+    return K
+
+
+def with_focal_scale(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camera":
+    """Copy of a camera with its focal lengths multiplied, its distortion kept as seen in the image.
+
+    In the models whose distortion is a polynomial of the normalised radius, the radius grows as the focal shrinks: the
+    coefficient of the 2k-th power goes with ``scale^2k``.
+    """
+    copy = pycolmap.Camera(camera.todict())
+    params = np.array(copy.params, dtype=float)
+    params[list(copy.focal_length_idxs())] *= scale
+    powers = _RADIAL_POWERS.get(copy.model_name, ())
+    for index, power in powers:
+        params[index] *= scale**power
+    copy.params = params
+    return copy
+
+
+_RADIAL_POWERS: dict[str, tuple[tuple[int, int], ...]] = {
+    "SIMPLE_RADIAL": ((3, 2),),
+    "RADIAL": ((3, 2), (4, 4)),
+    "OPENCV": ((4, 2), (5, 4), (6, 1), (7, 1)),
+    "FULL_OPENCV": ((4, 2), (5, 4), (6, 1), (7, 1), (8, 6), (9, 2), (10, 4), (11, 6)),
+}
+"""(index of the parameter, power of the normalised radius it goes with); tangential terms are of first order."""

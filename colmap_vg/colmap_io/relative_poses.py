@@ -1,0 +1,236 @@
+"""Trustworthy relative poses of a database's pairs, each by what COLMAP found it to be, and refined on its inliers.
+
+Stored poses are candidates like others: they are used where the inliers fit them best. Seen on real databases: poses
+that are identity and zero with E filled in, homographies whose stored pose is 85 degrees off.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.cameras import calibration_matrix
+from colmap_vg.colmap_io.tables import DatabaseTables
+from colmap_vg.epipolar.edge_information import refine_relative_poses
+from colmap_vg.geometry.directions import normalized
+from colmap_vg.two_view.eight_point import estimate_essential_from_inliers
+from colmap_vg.two_view.essential import (
+    RelativePoses,
+    essential_from_fundamental,
+    essential_from_pose,
+    judged_poses,
+    poses_from_essential,
+    sampson_errors,
+)
+from colmap_vg.two_view.homography import calibrated_homography, poses_from_homography, pure_rotations
+from colmap_vg.two_view.segments import evenly_thinned, segment_quantiles, segment_subset
+from colmap_vg.verdicts import EdgeVerdict
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+DEGENERATE, CALIBRATED, UNCALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC, WATERMARK = 1, 2, 3, 4, 5, 6, 7
+
+MIN_SHARE_IN_FRONT = 0.5
+"""Below this share of matches in front of both cameras a pose is a guess."""
+MAX_MEDIAN_ERROR_PX = 4.0
+"""COLMAP's own two-view threshold; a pose whose median match is beyond it explains nothing."""
+MIN_ANGLE = np.radians(0.2)
+"""Median triangulation angle below which the direction of a pair says nothing."""
+ROTATION_SHARE = 1.2
+"""A pair is a pure rotation when that explains its matches within this factor of the full pose's median error."""
+MAX_MATCHES_PER_POSE = 1000
+"""Matches of a pair that its pose is refined on, evenly over its list."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairGeometry:
+    """Relative poses of pairs and what can be said of them.
+
+    Attributes
+    ----------
+    rotations : (m, 3, 3) array
+        cam2_from_cam1.
+    directions : (m, 3) array
+    angles : (m,) array
+        Median triangulation angles, radians.
+    planar : (m,) bool array
+    verdicts : (m,) str array
+    """
+
+    rotations: Array
+    directions: Array
+    angles: Array
+    planar: BoolArray
+    verdicts: NDArray[np.str_]
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """Rays of all pairs' inliers."""
+
+    offsets: IntArray
+    bearings1: Array
+    bearings2: Array
+
+    def medians(self, poses: RelativePoses) -> Array:
+        """Median Sampson error of each pair, radians; infinite for pairs without matches."""
+        E = essential_from_pose(poses.rotations, poses.directions)
+        error = np.abs(sampson_errors(E, self.offsets, self.bearings1, self.bearings2))
+        return np.nan_to_num(segment_quantiles(self.offsets, error), nan=np.inf)
+
+    def thinned(self, limit: int) -> "_Matches":
+        thin = evenly_thinned(self.offsets, limit)
+        return _Matches(segment_subset(self.offsets, thin), self.bearings1[thin], self.bearings2[thin])
+
+
+def relative_poses(
+    tables: DatabaseTables,
+    focal_scales: Array,
+    focal_trusted: BoolArray,
+    offsets: IntArray,
+    bearings1: Array,
+    bearings2: Array,
+    min_num_inliers: int,
+) -> PairGeometry:
+    """Relative poses of all pairs, with a verdict for each.
+
+    Parameters
+    ----------
+    tables : DatabaseTables
+    focal_scales : (c,) array
+        Factors on the database's focal lengths under which the bearings were taken.
+    focal_trusted : (c,) bool array
+        Where both cameras' focal lengths are, UNCALIBRATED pairs are refused.
+    offsets : (m + 1,) int array
+    bearings1, bearings2 : (k, 3) array
+    min_num_inliers : int
+
+    Returns
+    -------
+    PairGeometry
+    """
+    m = len(tables.pairs)
+    every = _Matches(offsets, bearings1, bearings2)
+    matches = every.thinned(MAX_MATCHES_PER_POSE)
+    cameras = tables.camera_idx[tables.pairs]
+    K = np.stack([calibration_matrix(c, s) for c, s in zip(tables.cameras, focal_scales, strict=True)])
+    K1, K2 = K[cameras[:, 0]], K[cameras[:, 1]]
+    unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
+
+    poses = _poses_from_matrices(tables, matches, K1, K2, unchanged)
+    planar = np.isin(tables.configs, (PLANAR, PLANAR_OR_PANORAMIC))
+    poses = _better_planar(tables, matches, K1, K2, planar, poses)
+    poses = _better_stored(tables, matches, unchanged, poses)
+    focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
+    enough = np.diff(matches.offsets) >= max(min_num_inliers, 5)
+    refined = refine_relative_poses(
+        matches.offsets,
+        matches.bearings1,
+        matches.bearings2,
+        poses.rotations,
+        poses.directions,
+        focal[cameras[:, 0]],
+        focal[cameras[:, 1]],
+    )
+    rotations = np.where(enough[:, None, None], refined.rotations, poses.rotations)
+    directions = np.where(enough[:, None], refined.directions, poses.directions)
+    final = judged_poses(rotations, normalized(directions), matches.offsets, matches.bearings1, matches.bearings2)
+    turned = _pure_rotation(matches, final)
+    final = replace(final, rotations=np.where(turned[0][:, None, None], turned[1], final.rotations))
+    error_px = matches.medians(final) * np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]])
+    verdicts = np.full(m, EdgeVerdict.KEPT, dtype=object)
+    verdicts[turned[0] | (tables.configs == PANORAMIC)] = EdgeVerdict.ROTATION_ONLY
+    unexplained = (final.share_in_front < MIN_SHARE_IN_FRONT) & (verdicts == EdgeVerdict.KEPT)
+    verdicts[unexplained | ((error_px > MAX_MEDIAN_ERROR_PX) & ~turned[0])] = EdgeVerdict.NO_POSE
+    verdicts[(tables.configs == UNCALIBRATED) & focal_trusted[cameras].all(axis=1)] = EdgeVerdict.UNCALIBRATED
+    verdicts[tables.configs == WATERMARK] = EdgeVerdict.WATERMARK
+    verdicts[tables.configs == DEGENERATE] = EdgeVerdict.DEGENERATE
+    verdicts[np.diff(every.offsets) < min_num_inliers] = EdgeVerdict.FEW_INLIERS
+    return PairGeometry(final.rotations, final.directions, final.median_angles, planar, verdicts.astype(str))
+
+
+def _poses_from_matrices(
+    tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, unchanged: BoolArray
+) -> RelativePoses:
+    """Poses from E where it was found under the same focal lengths, else from F, else refitted from the matches."""
+    E = np.where(unchanged[:, None, None], tables.E, np.nan)
+    from_F = essential_from_fundamental(tables.F, K1, K2)
+    missing = ~_usable(E)
+    E = np.where(missing[:, None, None], from_F, E)
+    missing = ~_usable(E)
+    if missing.any():
+        refitted = estimate_essential_from_inliers(matches.offsets, matches.bearings1, matches.bearings2)
+        E = np.where(missing[:, None, None], refitted, E)
+    E = np.where(_usable(E)[:, None, None], E, np.diag([1.0, 1.0, 0.0]))
+    return poses_from_essential(E, matches.offsets, matches.bearings1, matches.bearings2)
+
+
+def _better_planar(
+    tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, planar: BoolArray, poses: RelativePoses
+) -> RelativePoses:
+    """The homography's better decomposition for planar pairs, where the matches like it more than E's pose."""
+    with_H = planar & _usable(tables.H)
+    if not with_H.any():
+        return poses
+    H = np.where(with_H[:, None, None], tables.H, np.eye(3))
+    found = poses_from_homography(
+        calibrated_homography(H, K1, K2), matches.offsets, matches.bearings1, matches.bearings2
+    )
+    return _where(with_H & _preferred(matches, found.better, poses), found.better, poses)
+
+
+def _better_stored(
+    tables: DatabaseTables, matches: _Matches, unchanged: BoolArray, poses: RelativePoses
+) -> RelativePoses:
+    """The stored pose where there is one and the matches like it more."""
+    length = np.linalg.norm(tables.translations, axis=1)
+    with np.errstate(invalid="ignore"):
+        present = unchanged & np.isfinite(tables.rotations).all(axis=(1, 2)) & (length > 0)
+    if not present.any():
+        return poses
+    R = np.where(present[:, None, None], tables.rotations, np.eye(3))
+    t = np.where(present[:, None], tables.translations, np.array([0.0, 0.0, 1.0]))
+    directions = normalized(-np.einsum("kba,kb->ka", R, t))
+    stored = judged_poses(R, directions, matches.offsets, matches.bearings1, matches.bearings2)
+    return _where(present & _preferred(matches, stored, poses), stored, poses)
+
+
+def _preferred(matches: _Matches, one: RelativePoses, other: RelativePoses) -> BoolArray:
+    """Whether the matches like one pose more: clearly more of them in front, or as many and a lower median error."""
+    margin = 0.1
+    ahead = one.share_in_front - other.share_in_front
+    closer = matches.medians(one) < matches.medians(other)
+    return np.asarray((ahead > margin) | ((ahead > -margin) & closer))
+
+
+def _where(mask: BoolArray, one: RelativePoses, other: RelativePoses) -> RelativePoses:
+    def pick(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np.generic]:
+        return np.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    return RelativePoses(
+        np.asarray(pick(one.rotations, other.rotations), dtype=float),
+        np.asarray(pick(one.directions, other.directions), dtype=float),
+        np.asarray(pick(one.num_in_front, other.num_in_front), dtype=np.int64),
+        np.asarray(pick(one.share_in_front, other.share_in_front), dtype=float),
+        np.asarray(pick(one.median_angles, other.median_angles), dtype=float),
+    )
+
+
+def _pure_rotation(matches: _Matches, poses: RelativePoses) -> tuple[BoolArray, Array]:
+    """Which pairs a rotation alone explains about as well, and that rotation."""
+    suspects = poses.median_angles < MIN_ANGLE
+    if not suspects.any():
+        return suspects, poses.rotations
+    found = pure_rotations(matches.offsets, matches.bearings1, matches.bearings2)
+    # A rotation must explain two coordinates of a match, an epipolar line one: sqrt(2) more for the same noise.
+    explained = found.median_errors <= ROTATION_SHARE * np.sqrt(2.0) * np.maximum(matches.medians(poses), 1e-4)
+    return np.asarray(suspects | (explained & (np.diff(matches.offsets) > 0))), found.rotations
+
+
+def _usable(matrices: Array) -> BoolArray:
+    """Matrices that are there: finite and not zero."""
+    return np.asarray(
+        np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.nan_to_num(matrices)).max(axis=(1, 2), initial=0.0) > 0)
+    )

@@ -1,0 +1,250 @@
+"""The rows of a COLMAP database as arrays, read straight by sqlite; every damaged row is named."""
+
+import sqlite3
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.database import reading
+from colmap_vg.errors import DatabaseError
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MAX_NUM_IMAGES = 2_147_483_647
+"""COLMAP's pair id is ``image_id1 * MAX_NUM_IMAGES + image_id2`` with ``image_id1 < image_id2``."""
+
+
+@dataclass(frozen=True, eq=False)
+class DatabaseTables:
+    """Cameras, images and verified pairs of a database; images by id, pairs by pair id.
+
+    Attributes
+    ----------
+    cameras : tuple of pycolmap.Camera
+    image_ids : (n,) int64 array
+    image_names : tuple of str
+    camera_idx : (n,) int64 array
+    keypoints : tuple of (k, 2) float32 array
+        Pixels, one array an image; empty for images without keypoints.
+    pairs : (m, 2) int64 array
+        Rows of images.
+    configs : (m,) int64 array
+        COLMAP's two-view configurations.
+    F, E, H : (m, 3, 3) array
+        NaN where the database holds none.
+    rotations, translations : (m, 3, 3), (m, 3) array
+        Stored cam2_from_cam1; NaN where there is none.
+    offsets : (m + 1,) int64 array
+        Inlier matches of pair k are rows ``offsets[k]:offsets[k + 1]`` of `matches`.
+    matches : (k, 2) int64 array
+        Keypoint indices in image 1 and image 2.
+    """
+
+    cameras: tuple["pycolmap.Camera", ...]
+    image_ids: IntArray
+    image_names: tuple[str, ...]
+    camera_idx: IntArray
+    keypoints: tuple[NDArray[np.float32], ...]
+    pairs: IntArray
+    configs: IntArray
+    F: Array
+    E: Array
+    H: Array
+    rotations: Array
+    translations: Array
+    offsets: IntArray
+    matches: IntArray
+
+    def matched_points(self, rows: IntArray, pairs: IntArray, offsets: IntArray, side: int) -> Array:
+        """Pixels (k, 2) of chosen rows of `matches` in image 1 (side 0) or 2 (side 1).
+
+        `pairs` are the pairs of the rows, `offsets` their segments in `rows`.
+        """
+        starts = np.concatenate([[0], np.cumsum([len(k) for k in self.keypoints])])
+        points = np.concatenate([*self.keypoints, np.zeros((0, 2), dtype=np.float32)])
+        image = np.repeat(self.pairs[pairs, side], np.diff(offsets))
+        return points[starts[image] + self.matches[rows, side]].astype(np.float64)
+
+
+def read_tables(database_path: str | PathLike[str]) -> DatabaseTables:
+    """All that mapping needs of a database, of the current or an older schema.
+
+    Raises
+    ------
+    DatabaseError
+        The file is no readable COLMAP database, or a row is damaged; the message names it.
+    """
+    with reading(database_path) as connection:
+        reader = _Reader(connection, str(database_path))
+        cameras = reader.cameras()
+        image_ids, names, camera_idx = reader.images({c.camera_id: k for k, c in enumerate(cameras)})
+        keypoints = reader.keypoints(image_ids)
+        return reader.pairs(tuple(cameras), image_ids, names, camera_idx, keypoints)
+
+
+class _Reader:
+    def __init__(self, connection: sqlite3.Connection, path: str) -> None:
+        self._connection, self._path = connection, path
+
+    def cameras(self) -> list["pycolmap.Camera"]:
+        query = "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY camera_id"
+        found = []
+        for camera_id, model, width, height, blob, prior in self._connection.execute(query):
+            where = f"camera {camera_id}"
+            params = self._values(blob, np.float64, where)
+            if not isinstance(width, int) or not isinstance(height, int) or width <= 0 or height <= 0:
+                raise self._damaged(where, f"its size is {width} x {height}")
+            try:
+                camera = pycolmap.Camera(
+                    camera_id=camera_id, model=pycolmap.CameraModelId(model), width=width, height=height, params=params
+                )
+            except (ValueError, TypeError, RuntimeError) as error:
+                raise self._damaged(where, f"camera model {model} is unknown") from error
+            if not camera.verify_params() or not np.isfinite(params).all():
+                raise self._damaged(where, f"its {len(params)} parameters do not fit the model {camera.model_name}")
+            if camera.is_spherical():
+                raise DatabaseError(f"{self._path}: {where} is spherical; cut the panoramas into perspective images")
+            if camera.mean_focal_length() <= 0:
+                raise self._damaged(where, f"its focal length is {camera.mean_focal_length():g}")
+            camera.has_prior_focal_length = bool(prior)
+            found.append(camera)
+        return found
+
+    def images(self, camera_rows: dict[int, int]) -> tuple[IntArray, tuple[str, ...], IntArray]:
+        rows = self._connection.execute("SELECT image_id, name, camera_id FROM images ORDER BY image_id").fetchall()
+        for image_id, name, camera_id in rows:
+            if camera_id not in camera_rows:
+                raise self._damaged(f"image {image_id} ({name})", f"it has camera {camera_id}, which does not exist")
+        ids = np.array([r[0] for r in rows], dtype=np.int64)
+        names = tuple(str(r[1]) for r in rows)
+        return ids, names, np.array([camera_rows[r[2]] for r in rows], dtype=np.int64)
+
+    def keypoints(self, image_ids: IntArray) -> tuple[NDArray[np.float32], ...]:
+        found = {int(i): np.zeros((0, 2), dtype=np.float32) for i in image_ids}
+        for image_id, rows, cols, blob in self._connection.execute("SELECT image_id, rows, cols, data FROM keypoints"):
+            where = f"keypoints of image {image_id}"
+            values = self._values(blob, np.float32, where)
+            if rows < 0 or (rows and cols < 2) or len(values) != rows * cols:
+                raise self._damaged(where, f"{len(values)} values for {rows} rows of {cols}")
+            if image_id in found and rows:
+                found[image_id] = values.reshape(rows, cols)[:, :2]
+        return tuple(found[int(i)] for i in image_ids)
+
+    def pairs(
+        self,
+        cameras: tuple["pycolmap.Camera", ...],
+        image_ids: IntArray,
+        names: tuple[str, ...],
+        camera_idx: IntArray,
+        keypoints: tuple[NDArray[np.float32], ...],
+    ) -> DatabaseTables:
+        columns = {row[1] for row in self._connection.execute("PRAGMA table_info(two_view_geometries)")}
+        matrices = [c if c in columns else f"NULL AS {c}" for c in ("F", "E", "H", "qvec", "tvec")]
+        rows = self._connection.execute(
+            f"SELECT pair_id, rows, cols, data, config, {', '.join(matrices)} FROM two_view_geometries"
+            " WHERE rows > 0 ORDER BY pair_id"
+        ).fetchall()
+        blobs, counts = [], []
+        for pair_id, num, cols, blob, *_ in rows:
+            where = self._pair_name(pair_id)
+            if cols != 2 or not isinstance(blob, bytes) or len(blob) != num * cols * 4:
+                size = len(blob) if isinstance(blob, bytes) else 0
+                raise self._damaged(where, f"its matches hold {size} bytes for {num} rows of {cols}")
+            blobs.append(blob)
+            counts.append(num)
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        matches = np.frombuffer(b"".join(blobs), dtype=np.uint32).reshape(-1, 2).astype(np.int64)
+        pair_ids = np.array([r[0] for r in rows], dtype=np.int64)
+        pairs = self._image_rows(pair_ids, image_ids)
+        self._check_matches(pairs, pair_ids, offsets, matches, keypoints)
+        quaternions = self._stacked([r[8] for r in rows], 4, pair_ids)
+        return DatabaseTables(
+            cameras,
+            image_ids,
+            names,
+            camera_idx,
+            keypoints,
+            pairs,
+            np.array([r[4] for r in rows], dtype=np.int64),
+            self._stacked([r[5] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            self._stacked([r[6] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            self._stacked([r[7] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            _rotations_from_wxyz(quaternions),
+            self._stacked([r[9] for r in rows], 3, pair_ids),
+            offsets,
+            matches,
+        )
+
+    def _image_rows(self, pair_ids: IntArray, image_ids: IntArray) -> IntArray:
+        pairs = np.stack([pair_ids // MAX_NUM_IMAGES, pair_ids % MAX_NUM_IMAGES], axis=1)
+        known = np.isin(pairs, image_ids).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
+        if not known.all():
+            pair = int(pair_ids[np.argmin(known)])
+            raise self._damaged(self._pair_name(pair), "it links an image to itself, or one that does not exist")
+        return np.searchsorted(image_ids, pairs).astype(np.int64)
+
+    def _check_matches(
+        self,
+        pairs: IntArray,
+        pair_ids: IntArray,
+        offsets: IntArray,
+        matches: IntArray,
+        keypoints: tuple[NDArray[np.float32], ...],
+    ) -> None:
+        if len(pairs) == 0:
+            return
+        num_keypoints = np.array([len(k) for k in keypoints])
+        highest = np.maximum.reduceat(matches, offsets[:-1], axis=0)
+        bad = np.flatnonzero((highest >= num_keypoints[pairs]).any(axis=1))
+        if len(bad):
+            k = bad[0]
+            raise self._damaged(
+                self._pair_name(int(pair_ids[k])),
+                f"it uses keypoints {highest[k].tolist()} of images with {num_keypoints[pairs[k]].tolist()} keypoints",
+            )
+
+    def _stacked(self, blobs: list[bytes | None], size: int, pair_ids: IntArray) -> Array:
+        out = np.full((len(blobs), size), np.nan)
+        for k, blob in enumerate(blobs):
+            if not blob:
+                continue
+            if len(blob) != 8 * size:
+                where = self._pair_name(int(pair_ids[k]))
+                raise self._damaged(where, f"a matrix of its geometry holds {len(blob)} bytes, expected {8 * size}")
+            out[k] = np.frombuffer(blob)
+        return out
+
+    def _values(self, blob: object, kind: type, where: str) -> NDArray[np.generic]:
+        if blob is None:
+            return np.zeros(0, dtype=kind)
+        if not isinstance(blob, bytes) or len(blob) % np.dtype(kind).itemsize:
+            raise self._damaged(where, "its data are cut off")
+        return np.frombuffer(blob, dtype=kind)
+
+    def _pair_name(self, pair_id: int) -> str:
+        return f"pair of images {pair_id // MAX_NUM_IMAGES} and {pair_id % MAX_NUM_IMAGES}"
+
+    def _damaged(self, where: str, what: str) -> DatabaseError:
+        return DatabaseError(f"{self._path}: {where} is damaged: {what}; extract and match these images again")
+
+
+def _rotations_from_wxyz(q: Array) -> Array:
+    """Rotation matrices of COLMAP's stored quaternions (w, x, y, z); NaN for none or zero ones."""
+    norm = np.linalg.norm(q, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        usable = norm[:, 0] > 0
+    out = np.full((len(q), 3, 3), np.nan)
+    w, x, y, z = (q[usable] / norm[usable]).T
+    out[usable] = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1),
+        ],
+        axis=1,
+    )
+    return out
