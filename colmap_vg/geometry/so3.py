@@ -110,6 +110,20 @@ def log(R: Array) -> Array:
     return np.asarray(factor[..., None] * v)
 
 
+def left_jacobian_inverse(w: Array) -> Array:
+    """Derivative of ``log(exp(v) exp(w))`` by v at v = 0: (..., 3) to (..., 3, 3); norms below 2 pi.
+
+    ``I - W/2 + (1 - (a/2) cot(a/2)) / a^2 W^2`` with ``W = hat(w)``, ``a = ||w||`` (Chirikjian; Sola et al., eq. 146).
+    """
+    squared = np.einsum("...i,...i->...", w, w)
+    small = squared < 1e-4
+    half = 0.5 * np.sqrt(np.where(small, 1.0, squared))
+    series = 1.0 / 12.0 + squared / 720.0 + squared * squared / 30240.0
+    factor = np.where(small, series, (1.0 - half / np.tan(half)) / (4.0 * half * half))
+    W = hat(w)
+    return np.asarray(np.eye(3) - 0.5 * W + factor[..., None, None] * (W @ W))
+
+
 def angle(R: Array) -> Array:
     """Rotation angles in radians, accurate near 0 and pi: (..., 3, 3) to (...)."""
     sine = np.linalg.norm(vee(R), axis=-1)

@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
-from colmap_vg.joint.pose_graph import PoseGraphProblem
+from colmap_vg.geometry.directions import tangent_basis
+from colmap_vg.joint.costs import ChordalCost, InformationCost, PoseGraphCost
+from colmap_vg.joint.pose_graph import PoseGraphSolver
 from colmap_vg.linear.anderson import fixed_point
 from colmap_vg.positions.fixed_point import MIN_RELATIVE_LENGTH
 from colmap_vg.positions.result import centered, spread, unit_weights
@@ -62,6 +64,7 @@ def solve_joint(
     weights: Array | None = None,
     *,
     rotation_weights: Array | None = None,
+    information: Array | None = None,
     accelerate: bool = True,
     max_num_iterations: int = 1000,
     tolerance: float = 1e-10,
@@ -83,6 +86,10 @@ def solve_joint(
         Multipliers of both terms, default 1 (the paper).
     rotation_weights : (m,) array, optional
         Further multipliers of the rotation term alone, default 1 (the paper).
+    information : (m, 5, 5) array, optional
+        What each edge knows of its rotation (vector in camera 2's frame) and direction (in ``tangent_basis`` of it),
+        as :class:`colmap_vg.epipolar.edge_information.RefinedEdges` holds it. It takes the place of the paper's equal
+        weights (its open question); `weights` multiply it, `rotation_weights` its rotation block.
     accelerate : bool
     max_num_iterations : int
         Outer iterations.
@@ -98,9 +105,10 @@ def solve_joint(
     GraphError
         The graph is not connected.
     """
-    problem = PoseGraphProblem(num_images, edges, cam2_from_cam1_rotations)
+    solver = PoseGraphSolver(num_images, edges)
     w = unit_weights(weights, len(edges))
     kappa = w * unit_weights(rotation_weights, len(edges))
+    known = None if information is None else _spatial_information(information, cam2_in_cam1_directions)
     start_Q, start_p = np.swapaxes(initial_rotations, 1, 2), centered(initial_centers)
     size = spread(start_p)
     unit = size / np.sqrt(num_images)
@@ -120,7 +128,14 @@ def solve_joint(
         length = np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
         tau = w if approach == "C" else w / length**2
         translations = length[:, None] * cam2_in_cam1_directions
-        Q, p, inner = problem.solve(Q, p, translations, kappa, tau, tolerance=inner_tolerance)
+        cost: PoseGraphCost
+        if known is None:
+            cost = ChordalCost(edges, cam2_from_cam1_rotations, translations, kappa, tau)
+        else:
+            root = np.sqrt(np.repeat(np.stack([kappa, tau], axis=1), 3, axis=1))
+            weighted = root[:, :, None] * known * root[:, None, :]
+            cost = InformationCost(edges, cam2_from_cam1_rotations, translations, weighted)
+        Q, p, inner = solver.solve(cost, Q, p, tolerance=inner_tolerance)
         last_cost = inner.cost
         # The global rotation is free: hold the first camera, so that the iteration has one fixed point.
         turn = start_Q[0] @ Q[0].T
@@ -142,3 +157,18 @@ def solve_joint(
     )
     Q, p = unpack(x)
     return JointResult(np.swapaxes(Q, 1, 2), p, last_cost, count, converged, tuple(log))
+
+
+def _spatial_information(information: Array, directions: Array) -> Array:
+    """Information on rotation vectors and on vectors along directions, (m, 6, 6).
+
+    A direction knows nothing of its own length, but without a term along it the scale factors would not hold the
+    positions apart: there the mean of its two tangents stands in, so that isotropic information gives the paper's cost.
+    """
+    lift = np.zeros((len(directions), 6, 5))
+    lift[:, :3, :3] = np.eye(3)
+    lift[:, 3:, 3:] = tangent_basis(directions)
+    spatial = lift @ information @ np.swapaxes(lift, 1, 2)
+    along = 0.5 * (information[:, 3, 3] + information[:, 4, 4])
+    spatial[:, 3:, 3:] += along[:, None, None] * directions[:, :, None] * directions[:, None, :]
+    return np.asarray(spatial)

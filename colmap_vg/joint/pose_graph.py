@@ -1,30 +1,34 @@
 """PS: pose-graph optimisation on SE(3), rotations and positions in one least-squares problem (eq. PGO).
 
-With ``Q_i`` camera to world (``cam_from_world`` transposed) and ``t_ij`` the measured translation from camera i to
-camera j in camera i's frame::
-
-    min  sum kappa_ij ||R_ij - Q_j^T Q_i||_F^2 + tau_ij ||Q_i t_ij - (p_j - p_i)||^2
-
-Levenberg-damped Newton steps ``Q <- exp(w) Q, p <- p + x`` with the exact Hessian of the chordal term (while it is
-definite) and the Gauss-Newton one of the translations; steps that raise the cost are refused.
+The objectives are in :mod:`colmap_vg.joint.costs`. Steps ``Q <- exp(w) Q, p <- p + x`` are Levenberg-Marquardt ones on
+sparse 6 x 6 blocks, Newton's near the end, with the first camera held; a step that raises the cost is refused. Where
+cost differences drown in rounding the gradient decides, so that the minimum is reached to rounding and not to its
+square root.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
+from colmap_vg.joint.costs import ChordalCost, EdgeTerms, InformationCost, PoseGraphCost
 from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
-from colmap_vg.linear.solvers import factorize
+from colmap_vg.linear.solvers import SingularMatrixError, factorize
 from colmap_vg.positions.result import check_connected, unit_weights
 from colmap_vg.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MIN_TRACE = 1.5
-"""Below this trace (about 75 degrees) the chordal Hessian loses definiteness and the Gauss-Newton one stands in."""
+MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
+"""Shares of the Hessian's diagonal."""
+NEWTON_BELOW = 1e-2
+"""Size of the gradient from which on the exact Hessian is tried: Gauss-Newton's took 50 to 100 steps to the end."""
+COST_ROUNDING = 1e-12
+"""Relative differences of costs below this are rounding: sums over up to a million edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +41,8 @@ class PoseGraphResult:
     projection_centers : (n, 3) array
     cost : float
     gradient : float
-        Largest entry of the cost's gradient, relative to the largest diagonal entry of its Hessian.
+        Largest entry of the cost's gradient over the largest diagonal entry of its Hessian: radians for rotations,
+        shares of the positions' RMS distance from the centroid for positions.
     num_iterations : int
     converged : bool
     log : tuple of LogEntry
@@ -52,14 +57,23 @@ class PoseGraphResult:
     log: tuple[LogEntry, ...]
 
 
-class PoseGraphProblem:
-    """A pose graph with its sparsity pattern, to be solved for changing translations and weights.
+@dataclass(frozen=True, eq=False)
+class _Linearization:
+    """Gradient (n, 6) at the cameras, its size, the edges' terms, and the Hessian's diagonal (n, 6)."""
+
+    gradient: Array
+    terms: EdgeTerms
+    diagonal: Array
+    size: float
+
+
+class PoseGraphSolver:
+    """Minimises pose-graph costs on one graph, whose sparsity pattern is sorted once.
 
     Parameters
     ----------
     num_images : int
     edges : (m, 2) int array
-    cam2_from_cam1_rotations : (m, 3, 3) array
 
     Raises
     ------
@@ -67,105 +81,87 @@ class PoseGraphProblem:
         The graph is not connected.
     """
 
-    def __init__(self, num_images: int, edges: IntArray, cam2_from_cam1_rotations: Array) -> None:
+    def __init__(self, num_images: int, edges: IntArray) -> None:
         check_connected(num_images, edges)
-        self.num_images, self.edges, self.relative = num_images, edges, cam2_from_cam1_rotations
+        self.num_images, self.edges = num_images, edges
         self._pattern = BlockPattern(num_images, edges, 6)
 
-    def cost(self, Q: Array, p: Array, t: Array, kappa: Array, tau: Array) -> float:
-        """The objective at camera-to-world rotations Q (n, 3, 3) and centres p (n, 3)."""
-        i, j = self.edges[:, 0], self.edges[:, 1]
-        chordal = self.relative - np.swapaxes(Q[j], 1, 2) @ Q[i]
-        residual = np.einsum("kab,kb->ka", Q[i], t) - (p[j] - p[i])
-        return float(np.sum(kappa * np.sum(chordal**2, axis=(1, 2))) + np.sum(tau * np.sum(residual**2, axis=1)))
-
-    def gradient(self, Q: Array, p: Array, t: Array, kappa: Array, tau: Array) -> Array:
-        """Gradient (n, 6) for ``Q <- exp(w) Q`` (first three) and p (last three)."""
-        _, s, residual, turn = self._terms(Q, p, t)
-        return self._gradient(s, residual, turn, kappa, tau)
+    def gradient(self, cost: PoseGraphCost, Q: Array, p: Array) -> Array:
+        """Gradient (n, 6) by w (first three) and x (last three) in ``Q <- exp(w) Q, p <- p + x``."""
+        return self._linearize(cost, Q, p).gradient
 
     def solve(
-        self,
-        Q: Array,
-        p: Array,
-        t: Array,
-        kappa: Array,
-        tau: Array,
-        *,
-        max_num_iterations: int = 100,
-        tolerance: float = 1e-12,
+        self, cost: PoseGraphCost, Q: Array, p: Array, *, max_num_iterations: int = 100, tolerance: float = 1e-12
     ) -> tuple[Array, Array, PoseGraphResult]:
-        """Minimise from (Q, p); returns camera-to-world rotations, centres, and the result."""
-        cost = self.cost(Q, p, t, kappa, tau)
-        damping, log, converged, size = 1e-10, [], False, np.inf
-        for iteration in range(max_num_iterations):
-            M, s, residual, turn = self._terms(Q, p, t)
-            gradient = self._gradient(s, residual, turn, kappa, tau)
-            ii, jj, ij = self._hessian(M, s, kappa, tau)
-            diagonal = sum_at_nodes(self.num_images, self.edges[:, 0], np.einsum("kaa->ka", ii)) + sum_at_nodes(
-                self.num_images, self.edges[:, 1], np.einsum("kaa->ka", jj)
-            )
-            size = float(np.abs(gradient / diagonal.max(axis=0)).max() / _scale(p))
-            log.append(LogEntry("pose_graph", iteration, cost, size))
-            if size <= tolerance:
-                converged = True
-                break
+        """Minimise from camera-to-world rotations Q (n, 3, 3) and centres p (n, 3).
+
+        Returns
+        -------
+        Q : (n, 3, 3) array
+            Camera to world.
+        p : (n, 3) array
+        result : PoseGraphResult
+        """
+        value, at = cost.value(Q, p), self._linearize(cost, Q, p)
+        damping, log = MIN_DAMPING, [LogEntry("pose_graph", 0, value, at.size)]
+        while at.size > tolerance and len(log) <= max_num_iterations:
             accepted = False
-            while damping < 1e6:
-                damped = np.einsum("na,ab->nab", damping * diagonal + 1e-13 * diagonal.max(), np.eye(6))
-                step = -factorize(self._pattern.assemble(ii, jj, ij, damped)).solve(gradient.ravel()).reshape(-1, 6)
-                Q_new, p_new = so3.exp(step[:, :3]) @ Q, p + step[:, 3:]
-                new_cost = self.cost(Q_new, p_new, t, kappa, tau)
-                if new_cost < cost:
-                    accepted = True
-                    break
-                damping *= 100.0
-            if not accepted:  # rounding: no step lowers the cost any more
-                converged = size <= max(1e4 * tolerance, 1e-7)
+            for trial_damping, step in self._trial_steps(at, damping):
+                new_Q, new_p = so3.exp(step[:, :3]) @ Q, p + step[:, 3:]
+                new_value = cost.value(new_Q, new_p)
+                if not new_value <= value + COST_ROUNDING * value:
+                    continue
+                new_at = self._linearize(cost, new_Q, new_p)
+                accepted = new_value < value - COST_ROUNDING * value or new_at.size < at.size
+                damping = max(trial_damping / 100.0, MIN_DAMPING)
+                break  # where rounding is reached, shorter steps would not tell either
+            if not accepted:
                 break
-            Q, p, cost = Q_new, p_new, new_cost
-            damping = max(damping / 100.0, 1e-10)
+            Q, p, value, at = new_Q, new_p, new_value, new_at
+            log.append(LogEntry("pose_graph", len(log), value, at.size))
+        converged = at.size <= max(tolerance, 1e-9)
         Q = so3.project(Q)
-        result = PoseGraphResult(np.swapaxes(Q, 1, 2), p, cost, size, len(log), converged, tuple(log))
+        result = PoseGraphResult(np.swapaxes(Q, 1, 2), p, value, at.size, len(log) - 1, converged, tuple(log))
         return Q, p, result
 
-    def _terms(self, Q: Array, p: Array, t: Array) -> tuple[Array, Array, Array, Array]:
-        i, j = self.edges[:, 0], self.edges[:, 1]
-        M = Q[j] @ self.relative @ np.swapaxes(Q[i], 1, 2)
-        s = np.einsum("kab,kb->ka", Q[i], t)
-        return M, s, s - (p[j] - p[i]), so3.vee(M)
-
-    def _gradient(self, s: Array, residual: Array, turn: Array, kappa: Array, tau: Array) -> Array:
-        # ||M - exp(u)||^2 with u = w_i - w_j has gradient -4 vee(M); delta (Q_i t) = w_i x s.
-        rotation, pull = -4.0 * kappa[:, None] * turn, 2.0 * tau[:, None] * residual
-        at_i = np.concatenate([rotation + np.cross(s, pull), pull], axis=1)
-        at_j = np.concatenate([-rotation, -pull], axis=1)
-        return sum_at_nodes(self.num_images, self.edges[:, 0], at_i) + sum_at_nodes(
-            self.num_images, self.edges[:, 1], at_j
+    def _linearize(self, cost: PoseGraphCost, Q: Array, p: Array) -> _Linearization:
+        terms = cost.derivatives(Q, p)
+        n, i, j = self.num_images, self.edges[:, 0], self.edges[:, 1]
+        gradient = sum_at_nodes(n, i, terms.gradient_i) + sum_at_nodes(n, j, terms.gradient_j)
+        diagonal = sum_at_nodes(n, i, np.einsum("kaa->ka", terms.ii)) + sum_at_nodes(
+            n, j, np.einsum("kaa->ka", terms.jj)
         )
+        rms = float(np.linalg.norm(p - p.mean(axis=0)) / np.sqrt(n))
+        tiny = np.finfo(float).tiny
+        turn = np.abs(gradient[:, :3]).max() / max(diagonal[:, :3].max(), tiny)
+        shift = np.abs(gradient[:, 3:]).max() / max(diagonal[:, 3:].max() * rms, tiny)
+        return _Linearization(gradient, terms, diagonal, float(max(turn, shift)))
 
-    def _hessian(self, M: Array, s: Array, kappa: Array, tau: Array) -> tuple[Array, Array, Array]:
-        trace = np.trace(M, axis1=1, axis2=2)
-        exact = trace[:, None, None] * np.eye(3) - 0.5 * (M + np.swapaxes(M, 1, 2))
-        C = 2.0 * kappa[:, None, None] * np.where(trace[:, None, None] > MIN_TRACE, exact, 2.0 * np.eye(3))
-        S, weight = so3.hat(s), 2.0 * tau[:, None, None]
-        ii = np.zeros((len(s), 6, 6))
-        jj, ij = np.zeros_like(ii), np.zeros_like(ii)
-        ii[:, :3, :3] = C + weight * (np.swapaxes(S, 1, 2) @ S)
-        ii[:, :3, 3:] = weight * S  # -S^T I = S
-        ii[:, 3:, :3] = np.swapaxes(ii[:, :3, 3:], 1, 2)
-        ii[:, 3:, 3:] = jj[:, 3:, 3:] = weight * np.eye(3)
-        jj[:, :3, :3] = C
-        ij[:, :3, :3] = -C
-        ij[:, :3, 3:] = -weight * S
-        ij[:, 3:, 3:] = -weight * np.eye(3)
-        return ii, jj, ij
+    def _trial_steps(self, at: _Linearization, damping: float) -> Iterator[tuple[float, Array]]:
+        """Steps (n, 6) to be tried in turn: Newton's where it may serve, then Levenberg's with growing damping."""
+        terms = at.terms
+        if at.size < NEWTON_BELOW and terms.curvature_ii is not None and terms.curvature_ij is not None:
+            ii, ij = terms.ii.copy(), terms.ij.copy()
+            ii[:, :3, :3] += terms.curvature_ii
+            ij[:, :3, :3] += terms.curvature_ij
+            step = self._step(at, ii, ij, MIN_DAMPING)
+            if step is not None and np.vdot(step, at.gradient) < 0.0:
+                yield damping, step
+        while damping <= MAX_DAMPING:
+            step = self._step(at, terms.ii, terms.ij, damping)
+            if step is not None:
+                yield damping, step
+            damping *= 100.0
 
-
-def _scale(p: Array) -> float:
-    """Root mean square distance from the centroid, at least 1 for a collapsed set."""
-    spread = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
-    return max(spread, 1.0)
+    def _step(self, at: _Linearization, ii: Array, ij: Array, damping: float) -> Array | None:
+        level = damping * at.diagonal + MIN_DAMPING * at.diagonal.max(axis=0)
+        # The gauge leaves six directions free; extra stiffness at one camera fixes them and bends nothing else.
+        level[0] += at.diagonal[0] + at.diagonal.mean(axis=0)
+        try:
+            factor = factorize(self._pattern.assemble(ii, at.terms.jj, ij, level[:, :, None] * np.eye(6)))
+        except SingularMatrixError:
+            return None
+        return -factor.solve(at.gradient.ravel()).reshape(-1, 6)
 
 
 def solve_pose_graph(
@@ -178,10 +174,11 @@ def solve_pose_graph(
     rotation_weights: Array | None = None,
     translation_weights: Array | None = None,
     *,
+    information: Array | None = None,
     max_num_iterations: int = 100,
     tolerance: float = 1e-12,
 ) -> PoseGraphResult:
-    """Minimise the pose-graph cost from given poses.
+    """Minimise a pose-graph cost from given poses.
 
     Parameters
     ----------
@@ -195,30 +192,33 @@ def solve_pose_graph(
         cam_from_world.
     initial_centers : (n, 3) array
     rotation_weights, translation_weights : (m,) array, optional
-        kappa and tau, default 1.
+        kappa and tau of :class:`~colmap_vg.joint.costs.ChordalCost`, default 1.
+    information : (m, 6, 6) array, optional
+        Of rotation vector (camera 2's frame) and translation (camera 1's frame), in this order; then the cost is
+        :class:`~colmap_vg.joint.costs.InformationCost`, and the two kinds of weights multiply its two blocks.
     max_num_iterations : int
     tolerance : float
-        On the largest gradient entry relative to the Hessian's largest diagonal entry and the spread of positions.
+        On :attr:`PoseGraphResult.gradient`.
 
     Returns
     -------
     PoseGraphResult
-        The gauge is the start's, up to rounding.
+        The first camera keeps its pose, up to damping.
 
     Raises
     ------
     GraphError
-        The graph is not connected.
+        The graph is not connected, or `information` has another shape.
     """
-    problem = PoseGraphProblem(num_images, edges, cam2_from_cam1_rotations)
-    kappa, tau = unit_weights(rotation_weights, len(edges)), unit_weights(translation_weights, len(edges))
-    *_, result = problem.solve(
-        np.swapaxes(initial_rotations, 1, 2),
-        initial_centers,
-        cam2_in_cam1_translations,
-        kappa,
-        tau,
-        max_num_iterations=max_num_iterations,
-        tolerance=tolerance,
-    )
+    solver = PoseGraphSolver(num_images, edges)
+    m, R, t = len(edges), cam2_from_cam1_rotations, cam2_in_cam1_translations
+    kappa, tau = unit_weights(rotation_weights, m), unit_weights(translation_weights, m)
+    cost: PoseGraphCost = ChordalCost(edges, R, t, kappa, tau)
+    if information is not None:
+        if information.shape != (m, 6, 6):
+            raise GraphError(f"pose graph: information must have shape ({m}, 6, 6), found {information.shape}")
+        root = np.sqrt(np.repeat(np.stack([kappa, tau], axis=1), 3, axis=1))
+        cost = InformationCost(edges, R, t, root[:, :, None] * information * root[:, None, :])
+    Q = np.swapaxes(initial_rotations, 1, 2)
+    *_, result = solver.solve(cost, Q, initial_centers, max_num_iterations=max_num_iterations, tolerance=tolerance)
     return result

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from position_problems import ring_problem
 from scipy.optimize import lsq_linear
 
 from colmap_vg import align_positions
@@ -11,7 +12,6 @@ from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.positions.result import centered
-from position_problems import ring_problem
 
 
 def _generic_solution(num_images, edges, directions, weights):
