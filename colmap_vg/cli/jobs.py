@@ -8,8 +8,8 @@ import pycolmap
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.cli.summary import edge_summary, image_summary, job_summary, model_summary, plain, write_summary
 from colmap_vg.errors import MappingError
-from colmap_vg.image_folder import DATABASE_NAME, image_names, make_database
-from colmap_vg.mapper import view_graph_mapping
+from colmap_vg.image_folder import DATABASE_NAME, make_database
+from colmap_vg.mapper import MappingResult, map_database
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
 from colmap_vg.output_folder import prepare_output, publish_models, refuse_models
 from colmap_vg.stages import StageLog
@@ -34,10 +34,10 @@ def run(
     log = StageLog(reporter.on_event)
     result = make_database(image_path, output_path, features, log, overwrite=options.overwrite, resume=resume)
     database_path = output_path / DATABASE_NAME
-    models = view_graph_mapping(database_path, image_path, output_path, options, on_event=reporter.on_event)
+    mapped = map_database(database_path, image_path, output_path, options, log)
     asked = {"image_path": image_path, "output_path": output_path, "features": features, "mapping": options}
     skipped = {file.name: file.reason for file in result.skipped}
-    _finish("run", {**asked, "resume": resume}, database_path, models, output_path, reporter, skipped)
+    _finish("run", {**asked, "resume": resume}, mapped, output_path, reporter, skipped)
 
 
 def mapper(
@@ -50,9 +50,9 @@ def mapper(
 ) -> None:
     """From a database to models."""
     configure_colmap_log(reporter.verbose)
-    models = view_graph_mapping(database_path, image_path, output_path, options, on_event=reporter.on_event)
+    mapped = map_database(database_path, image_path, output_path, options, StageLog(reporter.on_event))
     asked = {"database_path": database_path, "image_path": image_path, "output_path": output_path, "mapping": options}
-    _finish("mapper", {**asked, "resume": resume}, database_path, models, output_path, reporter, {})
+    _finish("mapper", {**asked, "resume": resume}, mapped, output_path, reporter, {})
 
 
 def solve(
@@ -66,7 +66,7 @@ def solve(
 ) -> None:
     """The viewing graph only: a model of poses without points."""
     from colmap_vg.colmap_io.read import read_view_graph
-    from colmap_vg.colmap_io.reconstruction import reconstruction_from_solution
+    from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
     from colmap_vg.solve import solve_view_graph
 
     configure_colmap_log(reporter.verbose)
@@ -81,9 +81,11 @@ def solve(
     if not solution.registered.any():
         raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")
     with log.stage("write"):
-        staged = prepare_output(output_path, overwrite) / "0"
+        work = prepare_output(output_path, overwrite)
+        staged = work / "0"
         staged.mkdir(exist_ok=True)
-        reconstruction_from_solution(database_path, solution, graph).write(staged)
+        with loaded_cache(database_path, work, read.min_num_inliers) as cache:
+            reconstruction_from_solution(cache, solution, graph).write(staged)
         publish_models([staged], output_path)
         log.result(str(output_path / "0"))
     asked = {"database_path": database_path, "output_path": output_path, "read": read, "solve": options}
@@ -125,25 +127,24 @@ def demo(
 def _finish(
     verb: str,
     asked: Mapping[str, object],
-    database_path: Path,
-    models: Mapping[int, pycolmap.Reconstruction],
+    mapped: MappingResult,
     output_path: Path,
     reporter: Reporter,
     skipped: Mapping[str, str],
 ) -> None:
     """Write the summary of a mapping job, and say what came out."""
-    names = image_names(database_path)
-    registered = {image.name for model in models.values() for image in model.images.values() if image.has_pose}
-    verdicts = ["registered" if name in registered else "left_out" for name in names]
+    names, solution = mapped.graph.image_names, mapped.solution
     content = job_summary(verb, asked, reporter)
+    content["status"] = str(solution.status)
     content["images"] = image_summary(
         [*names, *skipped],
-        [*verdicts, *skipped.values()],
-        [*(name in registered for name in names), *[False] * len(skipped)],
+        [*solution.image_verdicts.tolist(), *skipped.values()],
+        [*solution.registered.tolist(), *[False] * len(skipped)],
     )
-    content["models"] = [model_summary(output_path / str(index), model) for index, model in models.items()]
+    content["edges"] = edge_summary(solution.edge_verdicts.tolist(), solution.edge_kept.tolist())
+    content["models"] = [model_summary(output_path / str(index), model) for index, model in mapped.models.items()]
     write_summary(output_path, content)
-    for index, model in models.items():
+    for index, model in mapped.models.items():
         size = f"{model.num_reg_images()} of {len(names)} images, {model.num_points3D()} points"
         error = f"mean reprojection error {model.compute_mean_reprojection_error():.2f} px"
         reporter.say(f"{output_path / str(index)}: {size}, {error}")

@@ -9,7 +9,7 @@ from colmap_vg.geometry.directions import normalized
 Array = NDArray[np.float64]
 
 MAX_REPROJECTION_PX = 0.5
-"""A ray that does not project back on its keypoint is wrong: some models return such rays beyond their field of view."""
+"""A ray that does not project back on its keypoint is wrong: some models return such rays past their field of view."""
 
 
 def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -36,10 +36,10 @@ def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Arr
     valid = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
     rays[~valid] = (0.0, 0.0, 1.0)
     if not camera.is_undistorted():
-        again = camera.img_from_cam(rays)
+        again = np.asarray(camera.img_from_cam(rays), dtype=float)
         with np.errstate(invalid="ignore"):
             valid &= np.abs(again - points).max(axis=1) <= MAX_REPROJECTION_PX
-    return normalized(rays), valid
+    return normalized(rays), np.asarray(valid)
 
 
 def calibration_matrix(camera: "pycolmap.Camera", focal_scale: float = 1.0) -> Array:
@@ -62,7 +62,7 @@ def with_focal_scale(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camer
     powers = _RADIAL_POWERS.get(copy.model_name, ())
     for index, power in powers:
         params[index] *= scale**power
-    copy.params = params
+    copy.params = params.tolist()
     return copy
 
 

@@ -74,7 +74,7 @@ def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:
     DatabaseError
         The copy cannot be made.
     """
-    return _copied(Path(database_path), folder / "database.db")
+    return _copied(Path(database_path), folder / "working_copy.db")
 
 
 def _has_log(path: Path) -> bool:

@@ -1,8 +1,8 @@
 """Whether the focal lengths of a database can be trusted, and those to use where they cannot.
 
-COLMAP calls a pair CALIBRATED when an essential matrix explains about as many matches as a fundamental matrix does.
-Under a wrong focal length it does not, and nearly every pair is UNCALIBRATED. But so are false pairs under a right one,
-so a doubt is settled by the fundamental matrices: each votes for the focal lengths that make it essential.
+The database's own words do not tell: with a prior, COLMAP verifies pairs by essential matrices and calls them
+CALIBRATED under a focal length 15 % off; without one, nearly every pair is UNCALIBRATED, and so are false pairs under a
+right focal length. The matches tell: each pair's fundamental matrix votes for the focals that make it essential.
 """
 
 from dataclasses import dataclass
@@ -23,9 +23,6 @@ BoolArray = NDArray[np.bool_]
 
 CALIBRATED, UNCALIBRATED = 2, 3
 """COLMAP's two-view configurations of general scenes."""
-MAX_UNCALIBRATED_SHARE = 0.25
-"""Share of a camera's matches in UNCALIBRATED pairs up to which a given focal length is not doubted. With right focal
-lengths it was under 15 % on six sets and 65 % on one full of false pairs."""
 MAX_MATCHES_PER_VOTE = 300
 """Matches of a pair that its vote uses, evenly over its list; more change the vote by less than its own error."""
 MAX_EFFECTIVE_MATCHES = 100.0
@@ -57,32 +54,10 @@ def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalD
     as_given = np.ones(len(prior))
     if options.trust_focal_lengths == "always":
         return FocalDecision(as_given, np.ones(len(prior), dtype=bool), ())
-    doubted = ~prior | (uncalibrated_shares(tables) > MAX_UNCALIBRATED_SHARE)
-    if options.trust_focal_lengths == "never":
-        doubted[:] = True
-    used = np.zeros(len(prior), dtype=bool)
-    used[tables.camera_idx[tables.pairs.ravel()]] = True
-    doubted &= used
-    if not doubted.any():
-        return FocalDecision(as_given, prior, ())
-    return _voted(tables, prior, doubted, options)
+    return _voted(tables, prior, options)
 
 
-def uncalibrated_shares(tables: DatabaseTables) -> Array:
-    """Share of each camera's matches in general pairs that COLMAP calls UNCALIBRATED, (c,); 0 without such pairs."""
-    counts = np.diff(tables.offsets).astype(float)
-    cameras = tables.camera_idx[tables.pairs]
-    c = len(tables.cameras)
-
-    def matches_in(configs: tuple[int, ...]) -> Array:
-        rows = np.isin(tables.configs, configs)
-        return np.bincount(cameras[rows].ravel(), weights=np.repeat(counts[rows], 2), minlength=c)
-
-    general = matches_in((CALIBRATED, UNCALIBRATED))
-    return np.asarray(matches_in((UNCALIBRATED,)) / np.maximum(general, 1.0))
-
-
-def _voted(tables: DatabaseTables, prior: BoolArray, doubted: BoolArray, options: ReadOptions) -> FocalDecision:
+def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> FocalDecision:
     given = np.array([c.focal_length_x for c in tables.cameras])
     agreement = _agreement(tables, given, options)
     if agreement is None:
@@ -90,10 +65,10 @@ def _voted(tables: DatabaseTables, prior: BoolArray, doubted: BoolArray, options
         return FocalDecision(np.ones(len(given)), prior, (caveat,))
     found, size = agreement.estimates, np.array([max(c.width, c.height) for c in tables.cameras])
     # A focal length given by EXIF or the user falls only to a vote that contradicts it, a guess to any reliable vote.
-    changed = doubted & np.where(prior, agreement.contradicted, found.reliable)
+    changed = np.where(prior, agreement.contradicted, found.reliable).astype(bool)
     scales = np.where(changed, found.focal_lengths / given, 1.0)
     # Cameras that cannot vote for themselves take the ratio of focal length to size that the folder's others have.
-    without = doubted & ~prior & ~found.reliable
+    without = ~prior & ~found.reliable
     if found.reliable.any():
         common = float(np.median((scales * given / size)[found.reliable]))
         scales = np.where(without, common * size / given, scales)
@@ -108,7 +83,8 @@ def _voted(tables: DatabaseTables, prior: BoolArray, doubted: BoolArray, options
             f"{int(without.sum())} of {len(given)} cameras have no focal length and too few pairs to find one;"
             + (" they take that of the other cameras." if found.reliable.any() else " COLMAP's guess is used.")
         )
-    return FocalDecision(scales, prior & ~changed & ~(options.trust_focal_lengths == "never"), tuple(caveats))
+    known = prior & ~changed & (options.trust_focal_lengths != "never")
+    return FocalDecision(np.asarray(scales, dtype=float), known, tuple(caveats))
 
 
 def _agreement(tables: DatabaseTables, given: Array, options: ReadOptions) -> FocalAgreement | None:

@@ -94,5 +94,5 @@ def _rays_of_matches(
         rays[rows], valid[rows] = found, good
     image = np.repeat(tables.pairs, np.diff(tables.offsets), axis=0)
     rows = starts[image] + tables.matches
-    keep = valid[rows].all(axis=1)
+    keep = np.asarray(valid[rows].all(axis=1))
     return segment_subset(tables.offsets, keep), tables.matches[keep], rays[rows[keep, 0]], rays[rows[keep, 1]]

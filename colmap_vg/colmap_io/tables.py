@@ -67,7 +67,7 @@ class DatabaseTables:
         starts = np.concatenate([[0], np.cumsum([len(k) for k in self.keypoints])])
         points = np.concatenate([*self.keypoints, np.zeros((0, 2), dtype=np.float32)])
         image = np.repeat(self.pairs[pairs, side], np.diff(offsets))
-        return points[starts[image] + self.matches[rows, side]].astype(np.float64)
+        return np.asarray(points[starts[image] + self.matches[rows, side]], dtype=np.float64)
 
 
 def read_tables(database_path: str | PathLike[str]) -> DatabaseTables:
@@ -131,7 +131,7 @@ class _Reader:
             if rows < 0 or (rows and cols < 2) or len(values) != rows * cols:
                 raise self._damaged(where, f"{len(values)} values for {rows} rows of {cols}")
             if image_id in found and rows:
-                found[image_id] = values.reshape(rows, cols)[:, :2]
+                found[image_id] = np.asarray(values.reshape(rows, cols)[:, :2], dtype=np.float32)
         return tuple(found[int(i)] for i in image_ids)
 
     def pairs(

@@ -1,0 +1,87 @@
+"""From a pose solution to a `pycolmap.Reconstruction` with the database's cameras, rigs, frames, images and ids."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from colmap_vg.colmap_io.cameras import with_focal_scale
+from colmap_vg.colmap_io.database import working_copy
+from colmap_vg.errors import DatabaseError
+from colmap_vg.solution import PoseSolution
+from colmap_vg.view_graph import ViewGraph
+
+
+@contextmanager
+def loaded_cache(
+    database_path: str | PathLike[str], work_folder: Path, min_num_matches: int
+) -> Iterator["pycolmap.DatabaseCache"]:
+    """COLMAP's view of a database, read from a copy that is gone afterwards: opening a database changes the file.
+
+    Raises
+    ------
+    DatabaseError
+        The copy cannot be made, or a rig has several sensors.
+    """
+    copy = working_copy(database_path, work_folder)
+    try:
+        with pycolmap.Database.open(copy) as database:
+            options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches, load_all_images=True)
+            cache = pycolmap.DatabaseCache.create(database, options)
+        _refuse_rigs(cache)
+        yield cache
+    finally:
+        for leftover in work_folder.glob(copy.name + "*"):
+            leftover.unlink()
+
+
+def _refuse_rigs(cache: "pycolmap.DatabaseCache") -> None:
+    for rig_id, rig in cache.rigs.items():
+        if rig.num_sensors() > 1:
+            raise DatabaseError(
+                f"rig {rig_id} of the database has {rig.num_sensors()} sensors; rigs are not supported yet: map the"
+                " images with pycolmap.global_mapping, or make the database without a rig"
+            )
+
+
+def reconstruction_from_solution(
+    cache: "pycolmap.DatabaseCache", solution: PoseSolution, graph: ViewGraph
+) -> "pycolmap.Reconstruction":
+    """Reconstruction of the solved poses, without points.
+
+    Parameters
+    ----------
+    cache : pycolmap.DatabaseCache
+        Of the database that the graph was read from.
+    solution : PoseSolution
+        Its focal factors go on top of the graph's focal lengths.
+    graph : ViewGraph
+
+    Returns
+    -------
+    pycolmap.Reconstruction
+        All images of the database; those registered in the solution have poses.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.load(cache)
+    if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
+        for camera_id, focal, scale in zip(
+            graph.camera_ids.tolist(), graph.camera_focal_lengths, solution.focal_scales, strict=True
+        ):
+            if reconstruction.exists_camera(camera_id):
+                camera = reconstruction.camera(camera_id)
+                factor = float(focal * scale / camera.mean_focal_length())
+                # Not touched where nothing changed, so that given calibrations stay as they are to the last bit.
+                if abs(factor - 1.0) > 1e-12:
+                    camera.params = with_focal_scale(camera, factor).params
+    for row in np.flatnonzero(solution.registered):
+        R, center = solution.cam_from_world_rotations[row], solution.projection_centers[row]
+        image = reconstruction.image(int(solution.image_ids[row]))
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center)
+        frame = reconstruction.frame(image.frame_id)
+        frame.set_cam_from_world(image.camera_id, pose)
+        reconstruction.register_frame(image.frame_id)
+    return reconstruction

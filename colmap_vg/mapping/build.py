@@ -1,0 +1,168 @@
+"""From poses to a finished model: triangulation, robust bundle adjustment, registration of what was left, colours.
+
+The heavy work is pycolmap's. Poses come in nearly right, so two short rounds of bundle adjustment do where a mapper
+that starts from rough poses needs many.
+"""
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from colmap_vg.mapping.options import (
+    MAX_REPROJECTION_PX,
+    MIN_TRIANGULATION_ANGLE_DEG,
+    bundle_options,
+    mapper_options,
+    triangulator_options,
+)
+from colmap_vg.mapping.support import supported_observations
+from colmap_vg.options import MappingOptions
+from colmap_vg.stages import StageLog
+
+MIN_SUPPORTED_OBSERVATIONS = 15
+"""Observations of points seen in three views or more that an image needs to stay: three times what fixes a pose."""
+
+
+@dataclass(frozen=True)
+class BuildResult:
+    """What became of the images while the model was built.
+
+    Attributes
+    ----------
+    added : frozenset of int
+        Ids of images that were registered against the triangulated points.
+    removed : frozenset of int
+        Ids of images that left because too few points fix them.
+    """
+
+    added: frozenset[int]
+    removed: frozenset[int]
+
+
+def build_model(
+    cache: "pycolmap.DatabaseCache",
+    reconstruction: "pycolmap.Reconstruction",
+    options: MappingOptions,
+    log: StageLog,
+) -> BuildResult:
+    """Triangulate and adjust a reconstruction of poses, in place, and register what is left.
+
+    Parameters
+    ----------
+    cache : pycolmap.DatabaseCache
+    reconstruction : pycolmap.Reconstruction
+        With the poses of the registered images, no points.
+    options : MappingOptions
+    log : StageLog
+
+    Returns
+    -------
+    BuildResult
+    """
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(reconstruction)
+    triangulator = triangulator_options(options)
+    with log.stage("triangulate"):
+        image_ids = sorted(reconstruction.reg_image_ids())
+        for count, image_id in enumerate(image_ids, start=1):
+            mapper.triangulate_image(triangulator, image_id)
+            log.progress(f"{count} of {len(image_ids)} images", count / len(image_ids))
+        mapper.complete_and_merge_tracks(triangulator)
+        log.result(f"{reconstruction.num_points3D()} points")
+    with log.stage("adjust"):
+        _adjust(mapper, options, max_num_iterations=10, function_tolerance=1e-3)
+        mapper.complete_and_merge_tracks(triangulator)
+        mapper.retriangulate(triangulator)
+        _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
+        log.result(_state(reconstruction))
+    with log.stage("register"):
+        removed = _remove_unsupported(mapper)
+        added = _register_left_out(mapper, options, frozenset(removed))
+        if added or removed:
+            mapper.complete_and_merge_tracks(triangulator)
+            _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
+            again = _remove_unsupported(mapper)
+            removed, added = removed | again, added - again
+        log.result(f"{len(added)} images added, {len(removed)} removed")
+    mapper.end_reconstruction(False)
+    reconstruction.update_point_3d_errors()
+    return BuildResult(frozenset(added), frozenset(removed))
+
+
+def extract_colors(
+    reconstruction: "pycolmap.Reconstruction", image_path: str | PathLike[str] | None, log: StageLog
+) -> None:
+    """Colours of points as the mean over their images; a caveat names the images that are missing."""
+    if image_path is None:
+        return
+    folder = Path(image_path)
+    missing = [
+        reconstruction.image(i).name
+        for i in reconstruction.reg_image_ids()
+        if not (folder / reconstruction.image(i).name).is_file()
+    ]
+    if missing:
+        log.warn(
+            f"{len(missing)} of {reconstruction.num_reg_images()} registered images are not in {folder}"
+            f" (first: {sorted(missing)[0]}); points seen only there stay black."
+        )
+    if len(missing) < reconstruction.num_reg_images():
+        reconstruction.extract_colors_for_all_images(folder)
+
+
+def _adjust(
+    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, max_num_iterations: int, function_tolerance: float
+) -> None:
+    """One round on tracks of three views or more, then the filter."""
+    reconstruction = mapper.reconstruction
+    bundle = bundle_options(
+        options, max_num_iterations=max_num_iterations, function_tolerance=function_tolerance, min_track_length=3
+    )
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(reconstruction.reg_image_ids()):
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
+    mapper.observation_manager.filter_observations_with_negative_depth()
+    mapper.observation_manager.filter_all_points3D(MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG)
+
+
+def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
+    """Deregister images that too few well-triangulated points fix, weakest first, until all that stay are fixed."""
+    reconstruction, removed = mapper.reconstruction, set()
+    while True:
+        support = supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG)
+        weak = [(count, image_id) for image_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]
+        if not weak:
+            return removed
+        _, image_id = min(weak)
+        mapper.observation_manager.deregister_frame(reconstruction.image(image_id).frame_id)
+        removed.add(image_id)
+
+
+def _register_left_out(
+    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, never: frozenset[int]
+) -> set[int]:
+    """Register images by PnP against the points, best first, until no more can be."""
+    registration, triangulator = mapper_options(options), triangulator_options(options)
+    added: set[int] = set()
+    while True:
+        candidates = [i for i in mapper.find_next_images(registration, False) if i not in never]
+        for image_id in candidates:
+            if mapper.register_next_image(registration, image_id):
+                mapper.triangulate_image(triangulator, image_id)
+                added.add(image_id)
+                break
+        else:
+            return added
+
+
+def _state(reconstruction: "pycolmap.Reconstruction") -> str:
+    reconstruction.update_point_3d_errors()
+    return (
+        f"{reconstruction.num_points3D()} points,"
+        f" mean reprojection error {np.nan_to_num(reconstruction.compute_mean_reprojection_error()):.2f} px"
+    )
