@@ -3,9 +3,9 @@
 On a turntable, where optical axes meet at equal distances, any focal gives each pair an essential matrix, and only its
 rotation angle changes. The angles of several pairs still have to agree: with a wrong focal, rotations around cycles of
 the view graph do not close. For each focal on a grid, relative poses are taken from the fundamental matrices, refined
-for a few steps, averaged robustly, and the residual angles ``r`` are compared with what each edge knows of its rotation:
-``c^2 log(1 + r^2 / (c^2 (v + s^2)))``, summed, ``v`` the mean variance of the edge's three rotation parameters. The
-minimum is refined on finer grids and by a parabola.
+for a few steps, averaged robustly, and the residual angles ``r`` are compared with what each edge knows of its
+rotation: ``c^2 log(1 + r^2 / (c^2 (v + s^2)))``, summed, ``v`` the mean variance of the edge's three rotation
+parameters. The minimum is refined on finer grids and by a parabola.
 """
 
 from dataclasses import dataclass
