@@ -167,11 +167,15 @@ class ViewGraph:
         loops = np.flatnonzero(edges[:, 0] == edges[:, 1])
         if len(loops):
             raise GraphError(f"ViewGraph.edges: edge {loops[0]} links image row {edges[loops[0], 0]} to itself")
-        _refuse("cam2_from_cam1_rotations", ~np.isfinite(R).all(axis=(1, 2)), "holds NaN or infinite values")
-        _refuse("cam2_in_cam1_directions", ~np.isfinite(g).all(axis=1), "holds NaN or infinite values")
-        skewed = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6
-        _refuse("cam2_from_cam1_rotations", skewed | (np.linalg.det(R) < 0), "is no rotation matrix")
-        _refuse("cam2_in_cam1_directions", np.abs(np.linalg.norm(g, axis=1) - 1.0) > 1e-6, "is no unit vector")
+        _refuse(
+            "cam2_from_cam1_rotations", np.asarray(~np.isfinite(R).all(axis=(1, 2))), "holds NaN or infinite values"
+        )
+        _refuse("cam2_in_cam1_directions", np.asarray(~np.isfinite(g).all(axis=1)), "holds NaN or infinite values")
+        skewed = np.asarray(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
+        _refuse("cam2_from_cam1_rotations", np.asarray(skewed | (np.linalg.det(R) < 0)), "is no rotation matrix")
+        _refuse(
+            "cam2_in_cam1_directions", np.asarray(np.abs(np.linalg.norm(g, axis=1) - 1.0) > 1e-6), "is no unit vector"
+        )
         if self.inlier_offsets is not None:
             o, k = self.inlier_offsets, 0 if self.inlier_bearings1 is None else len(self.inlier_bearings1)
             if o[0] != 0 or o[-1] != k or (np.diff(o) < 0).any():

@@ -157,7 +157,7 @@ def run(
             num_threads,
             random_seed,
         )
-        from colmap_vg.cli import jobs
+        import colmap_vg.cli.jobs as jobs
 
         jobs.run(image_path, output_path, features, options, resume, reporter)
 
@@ -219,7 +219,7 @@ def mapper(
         )
         for flag in ignored:
             reporter.warn(f"{flag} has no counterpart in colmap-vg and is ignored")
-        from colmap_vg.cli import jobs
+        import colmap_vg.cli.jobs as jobs
 
         jobs.mapper(database_path, image_path, output_path, options, resume, reporter)
 
@@ -255,7 +255,7 @@ def solve(
             ba_refine_focal_length,
             random_seed,
         )
-        from colmap_vg.cli import jobs
+        import colmap_vg.cli.jobs as jobs
 
         jobs.solve(database_path, output_path, read, options, overwrite, resume, reporter)
 
@@ -273,7 +273,7 @@ def demo(
 ) -> None:
     """Render photographs of a scene from known cameras, make a model of them, and compare it with the truth."""
     with _job(quiet, verbose) as reporter:
-        from colmap_vg.cli import jobs
+        import colmap_vg.cli.jobs as jobs
 
         jobs.demo(output_path, num_images, seed, num_threads, overwrite, resume, reporter)
 

@@ -76,7 +76,7 @@ def reconstruction_from_solution(
                 factor = float(focal * scale / camera.mean_focal_length())
                 # Not touched where nothing changed, so that given calibrations stay as they are to the last bit.
                 if abs(factor - 1.0) > 1e-12:
-                    camera.params = with_focal_scale(camera, factor).params
+                    camera.params = with_focal_scale(camera, factor).params.tolist()
     for row in np.flatnonzero(solution.registered):
         R, center = solution.cam_from_world_rotations[row], solution.projection_centers[row]
         image = reconstruction.image(int(solution.image_ids[row]))

@@ -26,6 +26,7 @@ BoolArray = NDArray[np.bool_]
 
 _COARSE = np.linspace(LOWEST, HIGHEST, 160)  # steps of 1.8 %
 _FINE = np.linspace(-0.036, 0.036, 41)  # around the coarse minimum, steps of 0.18 %
+_SHIFTS = np.linspace(-0.5, 0.5, 41)  # of all cameras together, between sweeps
 _FITTING_COST = CAUCHY_SCALE**2 * np.log(2.0)  # of a pair three standard deviations off
 _SUPPORTING_RISE = 4.0  # a pair supports a focal if one 25 % away costs it so much more
 _NEARBY = np.log(1.25)
@@ -93,12 +94,12 @@ def vote_focal_lengths(
     aspect_ratios: Array | None = None,
     min_support: int = 3,
     max_sigma: float = 0.03,
-    num_sweeps: int = 10,
+    num_sweeps: int = 20,
 ) -> FocalEstimates:
     """Focal length of each camera from the fundamental matrices of its pairs.
 
     All cameras are first taken to share one ratio of focal length to image size; then each follows its own pairs while
-    the others hold, in damped sweeps.
+    the others hold, in damped sweeps, between which all move together.
 
     Parameters
     ----------
@@ -151,7 +152,7 @@ def focal_agreement(
     aspect_ratios: Array | None = None,
     min_support: int = 3,
     max_sigma: float = 0.03,
-    num_sweeps: int = 10,
+    num_sweeps: int = 20,
     tolerance: float = 0.05,
     min_excess_cost: float = 1.0,
 ) -> FocalAgreement:
@@ -199,6 +200,8 @@ def _vote(
         best, sigmas = _minimized(sides, log_focals)
         # Two cameras' focals are mostly known as a product: full steps of both would overshoot.
         step = np.where(np.isfinite(sigmas), best - log_focals, 0.0) * (0.6 if several else 1.0)
+        if several:
+            step = step + _common_shift(sides, log_focals + step)
         log_focals = log_focals + step
         if np.abs(step).max(initial=0.0) < 1e-4:
             break
@@ -224,6 +227,15 @@ def _minimized(curves: FocalCurves, log_focals: Array) -> tuple[Array, Array]:
     # The cost is a chi-square: twice its inverse second derivative is the variance.
     sigma = np.where(inside, width * np.sqrt(2.0 / np.where(inside, bend, 1.0)), np.inf)
     return fine[row, k] + width * shift, sigma
+
+
+def _common_shift(curves: FocalCurves, log_focals: Array) -> float:
+    """Change of all cameras together that costs least: what sweeps over single cameras are slow to find."""
+    shift = 0.0
+    for grid in (_SHIFTS, _FINE):
+        shifted = log_focals[:, None] + (shift + grid)
+        shift += float(grid[np.argmin(curves.costs(shifted[curves.camera], shifted).sum(axis=0))])
+    return shift
 
 
 def _support(curves: FocalCurves, log_focals: Array) -> IntArray:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.errors import GraphError
-from colmap_vg.two_view.fundamental_covariance import cofactors
+from colmap_vg.two_view.eight_point import cofactors
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -57,15 +57,18 @@ class FocalCurves:
         return np.asarray(self.cameras == self.camera[:, None])
 
     def costs(self, log_f: Array, log_focals: Array) -> Array:
-        """``c^2 log(1 + h^2 / (c sd)^2)`` at log_f (o, g) of the camera that varies, others held at log_focals (n,)."""
+        """``c^2 log(1 + h^2 / (c sd)^2)`` at log_f (o, g) of the camera that varies, (o, g).
+
+        The others are held at log_focals, (n,), or (n, g) where they differ between the columns.
+        """
         deviation = self.deviations(log_f, log_focals)
         sd = np.exp(_interpolated(self.log_sd, log_f))
         return np.asarray(CAUCHY_SCALE**2 * np.log1p(np.square(deviation / (CAUCHY_SCALE * sd))))
 
     def deviations(self, log_f: Array, log_focals: Array) -> Array:
         """``h = (s1 - s2) / (s1 + s2)`` at log_f (o, g) of the camera that varies: (o, g)."""
-        held = log_focals[self.cameras]
-        f1, f2 = (np.exp(2.0 * np.where(self.varies[:, s, None], log_f, held[:, s, None])) for s in (0, 1))
+        held = (log_focals[:, None] if log_focals.ndim == 1 else log_focals)[self.cameras]
+        f1, f2 = (np.exp(2.0 * np.where(self.varies[:, s, None], log_f, held[:, s])) for s in (0, 1))
         n = _sums_of_squares(self.F)[:, :, None]
         k = _sums_of_squares(cofactors(self.F))[:, :, None]
         both = f1 * f2

@@ -12,8 +12,8 @@ class AndersonMixer:
     """Proposes the next point of ``x <- g(x)`` from the last few points and images.
 
     The proposal is only a guess: the caller iterates ``g`` on it, so the fixed point is the plain iteration's own. When
-    the residual ``||g(x) - x||`` grows by more than `max_growth` over the best one, the memory is thrown away and the plain
-    step is taken.
+    the residual ``||g(x) - x||`` grows by more than `max_growth` over the best one, the memory is thrown away and the
+    plain step is taken.
 
     Parameters
     ----------

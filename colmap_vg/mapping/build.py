@@ -132,7 +132,8 @@ def _adjust(
 
 def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
     """Deregister images that too few well-triangulated points fix, weakest first, until all that stay are fixed."""
-    reconstruction, removed = mapper.reconstruction, set()
+    reconstruction = mapper.reconstruction
+    removed: set[int] = set()
     while True:
         support = supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG)
         weak = [(count, image_id) for image_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]

@@ -27,7 +27,9 @@ def supported_observations(
     image_ids = sorted(reconstruction.reg_image_ids())
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     centers = np.array([reconstruction.image(i).projection_center() for i in image_ids]).reshape(-1, 3)
-    points, lengths, rows = [], [], []
+    points: list[Array] = []
+    lengths: list[int] = []
+    rows: list[int] = []
     for point in reconstruction.points3D.values():
         elements = point.track.elements
         if len(elements) >= min_track_length:

@@ -20,6 +20,7 @@ IntArray = NDArray[np.int64]
 _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # position of entry (i, j) among the six distinct ones
 _ROWS, _COLUMNS = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 _MIN_MATCHES = 8
+_NUM_RANK_STEPS = 3  # Newton steps to determinant zero; it converges quadratically
 
 
 def pair_products(points1: Array, points2: Array) -> Array:
@@ -36,16 +37,36 @@ def moments_from_products(products: Array) -> Array:
     return np.asarray(products[:, 6 * second + first].reshape(len(products), 9, 9))
 
 
-def matrix_of_least_moment(moments: Array) -> Array:
-    """Matrices of unit norm that minimise ``vec(E)^T M vec(E)`` after whitening both sides: (m, 9, 9) to (m, 3, 3)."""
+def matrix_of_least_moment(moments: Array, *, rank_two: bool = False) -> Array:
+    """Matrices of unit norm that minimise ``vec(E)^T M vec(E)`` after whitening both sides: (m, 9, 9) to (m, 3, 3).
+
+    With `rank_two` they are moved to determinant zero where that costs least by M, and not to the nearest in norm:
+    steps ``-det A^-1 c / (c^T A^-1 c)``, c the cofactors.
+    """
     by_side = moments.reshape(-1, 3, 3, 3, 3)
     whiten2 = _inverse_root(np.einsum("mijkj->mik", by_side))
     whiten1 = _inverse_root(np.einsum("mijil->mjl", by_side))
     both = np.einsum("mik,mjl->mijkl", whiten2, whiten1).reshape(-1, 9, 9)
+    whitened = both @ moments @ both
+    _, vectors = np.linalg.eigh(whitened)
+    e = vectors[:, :, 0]
+    if rank_two:
+        # Along e itself M is nearly zero, but only e's scale would change: that direction is closed.
+        level = np.trace(whitened, axis1=1, axis2=2)[:, None, None]
+        inverse = np.linalg.inv(whitened + level * (e[:, :, None] * e[:, None, :] + 1e-12 * np.eye(9)))
+        for _ in range(_NUM_RANK_STEPS):
+            c = cofactors(e.reshape(-1, 3, 3)).reshape(-1, 9)
+            cheapest = np.einsum("mab,mb->ma", inverse, c)
+            slope = np.einsum("ma,ma->m", c, cheapest)
+            e = e - (np.linalg.det(e.reshape(-1, 3, 3)) / np.maximum(slope, 1e-300))[:, None] * cheapest
     # (W2 x2)^T E' (W1 x1) = x2^T (W2 E' W1) x1, W symmetric.
-    _, vectors = np.linalg.eigh(both @ moments @ both)
-    E = whiten2 @ vectors[:, :, 0].reshape(-1, 3, 3) @ whiten1
+    E = whiten2 @ e.reshape(-1, 3, 3) @ whiten1
     return np.asarray(E / np.linalg.norm(E, axis=(1, 2), keepdims=True))
+
+
+def cofactors(F: Array) -> Array:
+    """Cofactor matrices, the derivative of the determinant: (m, 3, 3) to (m, 3, 3)."""
+    return np.stack([np.cross(F[:, 1], F[:, 2]), np.cross(F[:, 2], F[:, 0]), np.cross(F[:, 0], F[:, 1])], axis=1)
 
 
 def estimate_essential_from_inliers(
@@ -142,7 +163,7 @@ def _reweighted(
     for iteration in range(num_iterations):
         moments = moments_from_products(segment_sums(offsets, products, weights))
         moments[~enough] = np.eye(9)
-        E = _rank_two(matrix_of_least_moment(moments), on_sphere)
+        E = _rank_two(matrix_of_least_moment(moments, rank_two=not on_sphere), on_sphere)
         if iteration + 1 < num_iterations:
             weights = _sampson_weights(E, offsets, edge, points1, points2, min_scale, on_sphere)
     result[enough] = E[enough]

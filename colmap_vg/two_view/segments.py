@@ -64,7 +64,7 @@ def rows_of_segments(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, Int
 
 
 def evenly_thinned(offsets: IntArray, limit: int) -> NDArray[np.bool_]:
-    """Rows that thin each segment to at most `limit` of them, evenly over its order: (k,); all rows where limit is 0."""
+    """Rows that thin each segment to at most `limit` of them, evenly over its order: (k,); all where limit is 0."""
     counts = np.diff(offsets)
     if limit == 0 or (counts <= limit).all():
         return np.ones(int(offsets[-1]), dtype=bool)

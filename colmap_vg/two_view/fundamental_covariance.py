@@ -1,0 +1,92 @@
+"""How well the matches of each edge determine its fundamental matrix, for all edges at once.
+
+The Sampson cost is ``vec(F)^T M vec(F)`` with the weighted 9x9 moments M of the matches, so ``M / sigma^2`` is the
+information of F, restricted to the seven directions that change neither its norm nor its rank (Hartley & Zisserman
+§11.4.3; Csurka et al., Characterizing the uncertainty of the fundamental matrix, 1997).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.robust import cauchy_weight
+from colmap_vg.two_view.eight_point import cofactors, moments_from_products, pair_products
+from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_sums
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_CAUCHY_SCALE = 2.385  # of sigma
+_MIN_SIGMA_PX = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class FundamentalCovariances:
+    """Covariances of fundamental matrices.
+
+    Attributes
+    ----------
+    covariances : (m, 9, 9) array
+        Of the row-major ``vec(F)`` as F was given; rank seven.
+    sigmas_px : (m,) array
+        Robust standard deviation of the Sampson error, corrected for the seven fitted parameters.
+    """
+
+    covariances: Array
+    sigmas_px: Array
+
+
+def fundamental_covariances(
+    offsets: IntArray, points1: Array, points2: Array, F: Array, *, max_effective_matches: float = np.inf
+) -> FundamentalCovariances:
+    """Covariance of each fundamental matrix from its matches.
+
+    Parameters
+    ----------
+    offsets : (m + 1,) int array
+        Every edge needs at least eight matches.
+    points1, points2 : (k, 2) array
+        Matched keypoints, pixels.
+    F : (m, 3, 3) array
+        Fitted fundamental matrices, ``x2^T F x1 = 0``, of rank two.
+    max_effective_matches : float
+        What lens and keypoint model leave out does not average away with more matches: beyond this number further
+        matches add no information.
+
+    Returns
+    -------
+    FundamentalCovariances
+    """
+    size = max(float(np.abs(points1).max(initial=1.0)), float(np.abs(points2).max(initial=1.0)))
+    grow = np.array([size, size, 1.0])
+    scaled = grow[:, None] * F * grow
+    norm = np.linalg.norm(scaled, axis=(1, 2))
+    unit = scaled / norm[:, None, None]
+    moments, sigma = _information(offsets, points1 / size, points2 / size, unit, _MIN_SIGMA_PX / size)
+    count = np.diff(offsets)
+    moments *= np.minimum(1.0, max_effective_matches / np.maximum(count, 1))[:, None, None]
+    fixed, _ = np.linalg.qr(np.stack([unit.reshape(-1, 9), cofactors(unit).reshape(-1, 9)], axis=2))
+    free = np.eye(9) - fixed @ np.swapaxes(fixed, 1, 2)
+    level = np.trace(moments, axis1=1, axis2=2)[:, None, None]
+    # The relative floor bounds the covariance of directions that no match sees (planar pairs).
+    inverse = np.linalg.inv(free @ moments @ free + level * (np.eye(9) - free) + 1e-13 * level * np.eye(9))
+    back = (norm[:, None, None] / np.outer(grow, grow)).reshape(-1, 9)
+    covariances = back[:, :, None] * (free @ inverse @ free) * back[:, None, :]
+    return FundamentalCovariances(covariances, sigma * size)
+
+
+def _information(offsets: IntArray, points1: Array, points2: Array, F: Array, min_sigma: float) -> tuple[Array, Array]:
+    edge = segment_of_rows(offsets)
+    plane1, plane2 = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (points1, points2))
+    row_F = F[edge]
+    line2 = np.einsum("kij,kj->ki", row_F, plane1)
+    line1 = np.einsum("kij,ki->kj", row_F, plane2)
+    variance = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1) + 1e-300
+    squared = np.square(np.einsum("ki,ki->k", plane2, line2)) / variance
+    count = np.diff(offsets)
+    median = np.sqrt(segment_quantiles(offsets, squared))
+    sigma = np.maximum(1.4826 * median * np.sqrt(count / np.maximum(count - 7, 1)), min_sigma)
+    weights = cauchy_weight(squared / np.square(_CAUCHY_SCALE * sigma)[edge]) / variance
+    moments = moments_from_products(segment_sums(offsets, pair_products(plane1, plane2), weights))
+    return moments / np.square(sigma)[:, None, None], sigma

@@ -1,0 +1,30 @@
+"""Sums, quantiles and selections of segments against loops."""
+
+import itertools
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from colmap_vg.two_view.segments import rows_of_segments, segment_quantiles, segment_subset, segment_sums
+
+COUNTS = st.lists(st.integers(0, 6), min_size=1, max_size=8)
+
+
+@given(counts=COUNTS, quantile=st.sampled_from([0.0, 0.25, 0.5, 1.0]), seed=st.integers(0, 100))
+def test_segments_are_what_loops_give(counts, quantile, seed):
+    rng = np.random.default_rng(seed)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    values, weights = rng.standard_normal((offsets[-1], 2, 3)), rng.random(offsets[-1])
+    parts = [slice(a, b) for a, b in itertools.pairwise(offsets)]
+    np.testing.assert_allclose(segment_sums(offsets, values), [values[p].sum(axis=0) for p in parts], atol=1e-12)
+    weighted = [(weights[p, None, None] * values[p]).sum(axis=0) for p in parts]
+    np.testing.assert_allclose(segment_sums(offsets, values, weights), weighted, atol=1e-12)
+    expected = [np.quantile(values[p, 0, 0], quantile) if p.stop > p.start else np.nan for p in parts]
+    np.testing.assert_allclose(segment_quantiles(offsets, values[:, 0, 0], quantile), expected, atol=1e-12)
+    keep = weights > 0.5
+    np.testing.assert_array_equal(np.diff(segment_subset(offsets, keep)), [keep[p].sum() for p in parts])
+    chosen = np.flatnonzero(rng.random(len(counts)) > 0.5)
+    rows, subset = rows_of_segments(offsets, chosen)
+    np.testing.assert_array_equal(rows, np.concatenate([np.arange(offsets[-1])[parts[k]] for k in chosen] or [[]]))
+    np.testing.assert_array_equal(np.diff(subset), np.diff(offsets)[chosen])
