@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.tables import DatabaseTables
-from colmap_vg.epipolar.focal import FocalAgreement, focal_agreement
+from colmap_vg.epipolar.self_calibration import SelfCalibration, estimate_focal_lengths
 from colmap_vg.options import ReadOptions
-from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
-from colmap_vg.two_view.fundamental_covariance import fundamental_covariances
 from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_subset
 
 Array = NDArray[np.float64]
@@ -25,8 +23,6 @@ CALIBRATED, UNCALIBRATED = 2, 3
 """COLMAP's two-view configurations of general scenes."""
 MAX_MATCHES_PER_VOTE = 300
 """Matches of a pair that its vote uses, evenly over its list; more change the vote by less than its own error."""
-MAX_EFFECTIVE_MATCHES = 100.0
-"""Beyond this number matches add no certainty to a vote: what the lens model leaves out does not average away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,53 +54,53 @@ def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalD
 
 
 def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> FocalDecision:
-    given = np.array([c.focal_length_x for c in tables.cameras])
-    agreement = _agreement(tables, given, options)
-    if agreement is None:
+    focals = np.array([c.focal_length_x for c in tables.cameras])
+    given = prior & (options.trust_focal_lengths != "never")
+    calibration = _self_calibration(tables, focals, given, options)
+    if calibration is None:
         caveat = "No pair has enough matches to check the focal lengths; they are taken as they are in the database."
-        return FocalDecision(np.ones(len(given)), prior, (caveat,))
-    found, size = agreement.estimates, np.array([max(c.width, c.height) for c in tables.cameras])
-    # A focal length given by EXIF or the user falls only to a vote that contradicts it, a guess to any reliable vote.
-    changed = np.where(prior, agreement.contradicted, found.reliable).astype(bool)
-    scales = np.where(changed, found.focal_lengths / given, 1.0)
+        return FocalDecision(np.ones(len(focals)), prior, (caveat,))
+    scales, size = calibration.focal_lengths / focals, np.array([max(c.width, c.height) for c in tables.cameras])
     # Cameras that cannot vote for themselves take the ratio of focal length to size that the folder's others have.
-    without = ~prior & ~found.reliable
-    if found.reliable.any():
-        common = float(np.median((scales * given / size)[found.reliable]))
-        scales = np.where(without, common * size / given, scales)
+    without = ~given & ~calibration.decided
+    if calibration.decided.any():
+        common = float(np.median((scales * focals / size)[calibration.decided]))
+        scales = np.where(without, common * size / focals, scales)
     caveats = [
-        f"Camera {c.camera_id}: the focal length {g:.1f} px of the database is contradicted by its image pairs;"
-        f" {s * g:.1f} px is used instead."
-        for c, g, s, bad in zip(tables.cameras, given, scales, changed & prior, strict=True)
+        f"Camera {c.camera_id}: the focal length {f:.1f} px of the database is contradicted by its image pairs;"
+        f" {s * f:.1f} px is used instead."
+        for c, f, s, bad in zip(tables.cameras, focals, scales, calibration.found & prior, strict=True)
         if bad
     ]
     if without.any():
+        source = "they take that of the other cameras" if calibration.decided.any() else "COLMAP's guess is used"
         caveats.append(
-            f"{int(without.sum())} of {len(given)} cameras have no focal length and too few pairs to find one;"
-            + (" they take that of the other cameras." if found.reliable.any() else " COLMAP's guess is used.")
+            f"{int(without.sum())} of {len(focals)} cameras have no focal length, and their pairs do not tell it;"
+            f" {source}."
         )
-    known = prior & ~changed & (options.trust_focal_lengths != "never")
-    return FocalDecision(np.asarray(scales, dtype=float), known, tuple(caveats))
+    return FocalDecision(np.asarray(scales, dtype=float), given & ~calibration.found, tuple(caveats))
 
 
-def _agreement(tables: DatabaseTables, given: Array, options: ReadOptions) -> FocalAgreement | None:
-    counts = np.diff(tables.offsets)
-    general = np.isin(tables.configs, (CALIBRATED, UNCALIBRATED)) & (counts >= max(options.min_num_inliers, 16))
-    chosen = np.flatnonzero(general)
+def _self_calibration(
+    tables: DatabaseTables, focals: Array, given: BoolArray, options: ReadOptions
+) -> SelfCalibration | None:
+    enough = np.diff(tables.offsets) >= max(options.min_num_inliers, 16)
+    chosen = np.flatnonzero(np.isin(tables.configs, (CALIBRATED, UNCALIBRATED)) & enough)
     if len(chosen) == 0:
         return None
     rows, offsets = rows_of_segments(tables.offsets, chosen)
     thin = evenly_thinned(offsets, MAX_MATCHES_PER_VOTE)
     rows, offsets = rows[thin], segment_subset(offsets, thin)
     points1, points2 = (tables.matched_points(rows, chosen, offsets, side) for side in (0, 1))
-    F = estimate_fundamental_from_inliers(offsets, points1, points2)
-    covariances = fundamental_covariances(offsets, points1, points2, F, max_effective_matches=MAX_EFFECTIVE_MATCHES)
-    return focal_agreement(
-        given,
-        F,
-        tables.camera_idx[tables.pairs[chosen]],
+    return estimate_focal_lengths(
+        tables.pairs[chosen],
+        tables.camera_idx,
+        offsets,
+        points1,
+        points2,
+        focals,
         np.array([[c.principal_point_x, c.principal_point_y] for c in tables.cameras]),
         np.array([[c.width, c.height] for c in tables.cameras], dtype=float),
-        covariances=covariances.covariances,
+        given=given,
         aspect_ratios=np.array([c.focal_length_y / c.focal_length_x for c in tables.cameras]),
     )

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.epipolar.edge_information import refine_relative_poses
-from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.graph.components import components_by_size
@@ -24,6 +23,7 @@ from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows, segme
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 _COARSE = np.linspace(np.log(0.4), np.log(4.5), 15)  # steps of 19 %
 _FINER = (0.06, 0.02)  # half the step of the coarse grid and of the one after it: what the finer grids step by
@@ -34,6 +34,7 @@ _CAUCHY_SCALE = 3.0  # standard deviations
 _MODEL_SIGMA = 1e-3  # radians; lens model and correlated keypoints beside the matches' own noise
 _GATE_DEG = 2.0  # degrees, of the robust averaging
 _SIDE = np.log(1.25)
+_CHECKED_SHIFT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +43,11 @@ class CycleVote:
 
     Attributes
     ----------
-    ratio : float
-        Focal length over the longer image side, shared by all cameras whose focal was not given.
+    factor : float
+        On the unit focal lengths of the cameras asked, shared by them.
     focal_lengths : (c,) array
-        Pixels; given ones as they were.
-    log_ratios, costs : (g,) array
+        Pixels; those of cameras not asked as they were.
+    log_factors, costs : (g,) array
         The curve that was found: sums of saturating squared residuals, in squared standard deviations.
     rise : float
         Cost 25 % away, on the side where it is lower, over the cost at the minimum.
@@ -54,16 +55,16 @@ class CycleVote:
         The minimum lies inside the range, the curve rises by a tenth and by 9 on both sides, and the graph has cycles.
     """
 
-    ratio: float
+    factor: float
     focal_lengths: Array
-    log_ratios: Array
+    log_factors: Array
     costs: Array
     rise: float
     reliable: bool
 
 
 @dataclass(frozen=True, eq=False)
-class _Pairs:
+class CyclePairs:
     """Pairs of the largest component, their images renumbered, with a spread of their matches."""
 
     num_images: int
@@ -76,23 +77,91 @@ class _Pairs:
 
 
 def vote_focal_by_rotation_cycles(
+    pairs: CyclePairs, unit_focal_lengths: Array, aspect_ratios: Array, principal_points: Array, asked: BoolArray
+) -> CycleVote:
+    """Common factor on the focal lengths of the cameras asked at which relative rotations agree best.
+
+    For cameras that :func:`colmap_vg.epipolar.focal.vote_focal_lengths` calls unreliable.
+
+    Parameters
+    ----------
+    pairs : CyclePairs
+    unit_focal_lengths : (c,) array
+        Pixels: for cameras asked what the factor applies to, such as the longer image side; for others their focal
+        length.
+    aspect_ratios : (c,) array
+        Vertical over horizontal focal length.
+    principal_points : (c, 2) array
+        Pixels.
+    asked : (c,) bool array
+
+    Returns
+    -------
+    CycleVote
+    """
+
+    def cost(log_factor: float) -> float:
+        focal = unit_focal_lengths * np.where(asked, np.exp(log_factor), 1.0)
+        return _cycle_cost(pairs, focal, focal * aspect_ratios, principal_points)
+
+    curve = {float(x): cost(float(x)) for x in _COARSE}
+    for step in _FINER:
+        center = min(curve, key=lambda x: curve[x])
+        around = center + step * np.arange(-_NUM_FINER, _NUM_FINER + 1)
+        curve.update({float(x): cost(float(x)) for x in around if float(x) not in curve})
+    x = np.array(sorted(curve))
+    y = np.array([curve[v] for v in x])
+    log_factor, lowest = _parabola(x, y)
+    sides = np.interp([log_factor - _SIDE, log_factor + _SIDE], x, y)
+    num_cycles = len(pairs.images) - pairs.num_images + 1
+    inside = _COARSE[0] < log_factor < _COARSE[-1]
+    rises = sides.min() > 1.1 * lowest and sides.min() > lowest + 9.0
+    factor = float(np.exp(log_factor))
+    return CycleVote(
+        factor,
+        unit_focal_lengths * np.where(asked, factor, 1.0),
+        x,
+        y,
+        float(sides.min() / max(lowest, 1e-300)),
+        bool(inside and rises and num_cycles >= 3),
+    )
+
+
+def focal_fits_cycles(
+    pairs: CyclePairs, focal_lengths: Array, aspect_ratios: Array, principal_points: Array, asked: BoolArray
+) -> bool:
+    """Whether neither longer nor shorter focal lengths of the cameras asked close rotations better: three costs only.
+
+    Parameters
+    ----------
+    pairs, aspect_ratios, principal_points, asked
+        As for :func:`vote_focal_by_rotation_cycles`.
+    focal_lengths : (c,) array
+        Pixels.
+
+    Returns
+    -------
+    bool
+    """
+    factors = [np.where(asked, np.exp(shift), 1.0) for shift in (0.0, -_CHECKED_SHIFT, _CHECKED_SHIFT)]
+    at, shorter, longer = (
+        _cycle_cost(pairs, focal_lengths * f, focal_lengths * f * aspect_ratios, principal_points) for f in factors
+    )
+    return min(shorter, longer) >= at
+
+
+def chosen_pairs(
     F: Array,
     edges: IntArray,
     camera_idx: IntArray,
     offsets: IntArray,
     points1: Array,
     points2: Array,
-    principal_points: Array,
-    image_sizes: Array,
     *,
-    known_focal_lengths: Array | None = None,
-    aspect_ratios: Array | None = None,
     max_num_pairs: int = 1000,
     min_num_matches: int = 30,
-) -> CycleVote:
-    """Common ratio of focal length to image size at which relative rotations agree best.
-
-    For cameras that :func:`colmap_vg.epipolar.focal.vote_focal_lengths` calls unreliable.
+) -> CyclePairs | None:
+    """The pairs that rotation cycles are looked for in; None where they connect fewer than three images.
 
     Parameters
     ----------
@@ -105,14 +174,6 @@ def vote_focal_by_rotation_cycles(
     offsets : (m + 1,) int array
     points1, points2 : (k, 2) array
         Matched keypoints, pixels.
-    principal_points : (c, 2) array
-        Pixels.
-    image_sizes : (c,) or (c, 2) array
-        Pixels; of two, the larger counts.
-    known_focal_lengths : (c,) array, optional
-        Given focal lengths in pixels; NaN where the vote is asked.
-    aspect_ratios : (c,) array, optional
-        Vertical over horizontal focal length; 1 where missing.
     max_num_pairs : int
         Pairs with most matches that are used.
     min_num_matches : int
@@ -120,55 +181,8 @@ def vote_focal_by_rotation_cycles(
 
     Returns
     -------
-    CycleVote
-
-    Raises
-    ------
-    GraphError
-        Fewer than three images are connected by pairs that can be used.
+    CyclePairs or None
     """
-    sizes = np.asarray(image_sizes if image_sizes.ndim == 1 else image_sizes.max(axis=1), dtype=np.float64)
-    aspect = np.ones(len(sizes)) if aspect_ratios is None else aspect_ratios
-    given = np.full(len(sizes), np.nan) if known_focal_lengths is None else known_focal_lengths
-    pairs = _chosen_pairs(F, edges, camera_idx, offsets, points1, points2, max_num_pairs, min_num_matches)
-
-    def cost(log_ratio: float) -> float:
-        focal = np.where(np.isnan(given), np.exp(log_ratio) * sizes, given)
-        return _cycle_cost(pairs, focal, focal * aspect, principal_points)
-
-    curve = {float(x): cost(float(x)) for x in _COARSE}
-    for step in _FINER:
-        center = min(curve, key=lambda x: curve[x])
-        around = center + step * np.arange(-_NUM_FINER, _NUM_FINER + 1)
-        curve.update({float(x): cost(float(x)) for x in around if float(x) not in curve})
-    x = np.array(sorted(curve))
-    y = np.array([curve[v] for v in x])
-    log_ratio, lowest = _parabola(x, y)
-    sides = np.interp([log_ratio - _SIDE, log_ratio + _SIDE], x, y)
-    num_cycles = len(pairs.images) - pairs.num_images + 1
-    inside = _COARSE[0] < log_ratio < _COARSE[-1]
-    rises = sides.min() > 1.1 * lowest and sides.min() > lowest + 9.0
-    ratio = float(np.exp(log_ratio))
-    return CycleVote(
-        ratio,
-        np.where(np.isnan(given), ratio * sizes, given),
-        x,
-        y,
-        float(sides.min() / max(lowest, 1e-300)),
-        bool(inside and rises and num_cycles >= 3),
-    )
-
-
-def _chosen_pairs(
-    F: Array,
-    edges: IntArray,
-    camera_idx: IntArray,
-    offsets: IntArray,
-    points1: Array,
-    points2: Array,
-    max_num_pairs: int,
-    min_num_matches: int,
-) -> _Pairs:
     count = np.diff(offsets)
     usable = np.flatnonzero(np.isfinite(F).all(axis=(1, 2)) & (count >= min_num_matches))
     strongest = np.sort(usable[np.argsort(-count[usable], kind="stable")[:max_num_pairs]])
@@ -176,14 +190,12 @@ def _chosen_pairs(
     chosen = strongest[component[edges[strongest, 0]] == 0]
     images, renumbered = np.unique(edges[chosen], return_inverse=True)
     if len(images) < 3:
-        raise GraphError(
-            f"rotation cycles need three connected images, found {len(images)} with {min_num_matches} matches or more"
-        )
+        return None
     rows, of_chosen = rows_of_segments(offsets, chosen)
     place = np.arange(len(rows)) - of_chosen[:-1][segment_of_rows(of_chosen)]
     stride = np.maximum(count[chosen] // _MATCHES_PER_PAIR, 1)[segment_of_rows(of_chosen)]
     keep = place % stride == 0
-    return _Pairs(
+    return CyclePairs(
         len(images),
         renumbered.reshape(-1, 2).astype(np.int64),
         camera_idx[edges[chosen]],
@@ -194,7 +206,7 @@ def _chosen_pairs(
     )
 
 
-def _cycle_cost(pairs: _Pairs, focal_x: Array, focal_y: Array, principal_points: Array) -> float:
+def _cycle_cost(pairs: CyclePairs, focal_x: Array, focal_y: Array, principal_points: Array) -> float:
     calibration = np.zeros((len(focal_x), 3, 3))
     calibration[:, 0, 0], calibration[:, 1, 1], calibration[:, 2, 2] = focal_x, focal_y, 1.0
     calibration[:, :2, 2] = principal_points

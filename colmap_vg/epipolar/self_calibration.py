@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.focal import FocalEstimates, vote_focal_lengths
-from colmap_vg.epipolar.focal_cycles import CycleVote, vote_focal_by_rotation_cycles
+from colmap_vg.epipolar.focal import FocalAgreement, focal_agreement
+from colmap_vg.epipolar.focal_cycles import CycleVote, chosen_pairs, focal_fits_cycles, vote_focal_by_rotation_cycles
 from colmap_vg.errors import GraphError
 from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
 from colmap_vg.two_view.fundamental_covariance import fundamental_covariances
@@ -16,29 +16,32 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+CYCLE_TOLERANCE = 0.08
+"""Relative difference from the cycles' vote that is not held against a given focal length: several of its errors."""
+
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """Focal lengths found from matches, and the fundamental matrices they were found with.
+    """Focal lengths found from matches, and what they were found by.
 
     Attributes
     ----------
     focal_lengths : (c,) array
-        Pixels: the pairs' vote where it is reliable, else the cycles' where that is, else the given ones.
-    reliable : (c,) bool array
-        Whether one of the two votes was.
-    by_pairs : FocalEstimates
+        Pixels: the given one where it is not contradicted; else the pairs' vote where it is reliable, else the cycles'.
+    found : (c,) bool array
+        The focal length is the matches', not the given one.
+    decided : (c,) bool array
+        A vote confirmed or replaced the focal length; elsewhere the matches do not know.
+    by_pairs : FocalAgreement
     by_cycles : CycleVote or None
-        None where the pairs' vote sufficed or too few images are connected.
-    fundamental_matrices : (m, 3, 3) array
-        Refitted to the matches; NaN for pairs with too few.
+        None where the pairs' vote sufficed, or given focal lengths close the cycles.
     """
 
     focal_lengths: Array
-    reliable: BoolArray
-    by_pairs: FocalEstimates
+    found: BoolArray
+    decided: BoolArray
+    by_pairs: FocalAgreement
     by_cycles: CycleVote | None
-    fundamental_matrices: Array
 
 
 def estimate_focal_lengths(
@@ -51,10 +54,10 @@ def estimate_focal_lengths(
     principal_points: Array,
     image_sizes: Array,
     *,
-    fundamental_matrices: Array | None = None,
+    given: BoolArray | None = None,
     aspect_ratios: Array | None = None,
-    min_num_matches: int = 30,
-    max_effective_matches: float = 300.0,
+    min_num_matches: int = 16,
+    max_effective_matches: float = 100.0,
     num_iterations: int = 5,
 ) -> SelfCalibration:
     """Focal length of every camera from verified matches, whatever focal length they were verified under.
@@ -72,19 +75,20 @@ def estimate_focal_lengths(
     points1, points2 : (k, 2) array
         Matched keypoints in undistorted pixels.
     focal_lengths : (c,) array
-        Given focal lengths, pixels; returned where neither vote is reliable.
+        Pixels, given or guessed.
     principal_points : (c, 2) array
         Pixels.
     image_sizes : (c,) or (c, 2) array
         Pixels.
-    fundamental_matrices : (m, 3, 3) array, optional
-        To start the refits from; NaN or missing: from the matches alone.
+    given : (c,) bool array, optional
+        Cameras whose focal length was given, by EXIF or the user: it falls only to a vote that contradicts it, a guess
+        to any reliable vote. Missing: none.
     aspect_ratios : (c,) array, optional
         Vertical over horizontal focal length; 1 where missing.
     min_num_matches : int
         Pairs with fewer are left out.
     max_effective_matches : float
-        See `fundamental_covariances`.
+        See `fundamental_covariances`; what the lens model leaves out does not average away.
     num_iterations : int
         Reweighting rounds of the refits.
 
@@ -97,6 +101,7 @@ def estimate_focal_lengths(
     GraphError
         No pair has enough matches.
     """
+    given = np.zeros(len(focal_lengths), dtype=bool) if given is None else given
     used = np.flatnonzero(np.diff(offsets) >= max(min_num_matches, 8))
     if not len(used):
         raise GraphError(
@@ -104,40 +109,40 @@ def estimate_focal_lengths(
         )
     rows, of_used = rows_of_segments(offsets, used)
     p1, p2 = points1[rows], points2[rows]
-    start = None
-    if fundamental_matrices is not None and np.isfinite(fundamental_matrices[used]).all():
-        start = fundamental_matrices[used]
-    fitted = estimate_fundamental_from_inliers(of_used, p1, p2, start, num_iterations=num_iterations)
-    known = fundamental_covariances(of_used, p1, p2, fitted, max_effective_matches=max_effective_matches)
-    by_pairs = vote_focal_lengths(
-        fitted,
+    F = estimate_fundamental_from_inliers(of_used, p1, p2, num_iterations=num_iterations)
+    known = fundamental_covariances(of_used, p1, p2, F, max_effective_matches=max_effective_matches)
+    votes = focal_agreement(
+        focal_lengths,
+        F,
         camera_idx[edges[used]],
         principal_points,
         image_sizes,
         covariances=known.covariances,
         aspect_ratios=aspect_ratios,
     )
-    F = np.full((len(edges), 3, 3), np.nan)
-    F[used] = fitted
-    found = np.where(by_pairs.reliable, by_pairs.focal_lengths, np.nan)
-    by_cycles, reliable = None, by_pairs.reliable
-    if not reliable.all() and len(np.unique(edges[used])) >= 3:
-        by_cycles = vote_focal_by_rotation_cycles(
-            F,
-            edges,
-            camera_idx,
-            offsets,
-            points1,
-            points2,
-            principal_points,
-            image_sizes,
-            known_focal_lengths=found,
-            aspect_ratios=aspect_ratios,
-            min_num_matches=min_num_matches,
-        )
-        if by_cycles.reliable:
-            found = by_cycles.focal_lengths
-            # A camera without pairs is not made reliable by what other cameras' cycles say.
-            reliable = reliable | (by_pairs.num_pairs > 0)
-    focal = np.where(np.isnan(found) | ~reliable, focal_lengths, found)
-    return SelfCalibration(focal, reliable, by_pairs, by_cycles, F)
+    by_pairs, reliable = votes.estimates, votes.estimates.reliable
+    found = np.where(given, votes.contradicted, reliable).astype(bool)
+    focal = np.where(found, by_pairs.focal_lengths, focal_lengths)
+    by_cycles, decided = None, reliable.copy()
+    # A camera without pairs is not decided by what other cameras' cycles say.
+    asked = ~reliable & (by_pairs.num_pairs > 0)
+    pairs = chosen_pairs(F, edges[used], camera_idx, of_used, p1, p2) if asked.any() else None
+    if pairs is not None:
+        aspect = np.ones(len(focal)) if aspect_ratios is None else aspect_ratios
+        guessed = asked & ~given
+        if guessed.any():
+            longer = image_sizes if image_sizes.ndim == 1 else image_sizes.max(axis=1)
+            by_cycles = vote_focal_by_rotation_cycles(
+                pairs, np.where(guessed, longer, focal), aspect, principal_points, guessed
+            )
+            takes = guessed & by_cycles.reliable
+        elif focal_fits_cycles(pairs, focal, aspect, principal_points, asked):
+            takes = np.zeros(len(focal), dtype=bool)
+        else:
+            by_cycles = vote_focal_by_rotation_cycles(pairs, focal, aspect, principal_points, asked)
+            takes = asked & (by_cycles.reliable and abs(np.log(by_cycles.factor)) > np.log1p(CYCLE_TOLERANCE))
+        if by_cycles is not None:
+            decided |= asked & by_cycles.reliable
+            focal = np.where(takes, by_cycles.focal_lengths, focal)
+        found |= takes
+    return SelfCalibration(focal, found, decided, votes, by_cycles)
