@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
@@ -24,6 +25,11 @@ from colmap_vg.stages import StageLog
 
 MIN_SUPPORTED_OBSERVATIONS = 15
 """Observations of points seen in three views or more that an image needs to stay: three times what fixes a pose."""
+
+MAX_NUM_ROUNDS = 6
+"""Rounds of adjusting and triangulating anew, at most."""
+SETTLED_COST = 0.7
+"""A round that leaves this share of its cost or more was the last: what is left then is noise."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +80,13 @@ def build_model(
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):
         _adjust(mapper, options, max_num_iterations=10, function_tolerance=1e-3)
-        mapper.complete_and_merge_tracks(triangulator)
-        mapper.retriangulate(triangulator)
-        _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
+        for _ in range(MAX_NUM_ROUNDS):
+            mapper.complete_and_merge_tracks(triangulator)
+            mapper.retriangulate(triangulator)
+            if _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5) > SETTLED_COST:
+                break
+        else:
+            log.warn(f"Bundle adjustment still lowered its cost after {MAX_NUM_ROUNDS} rounds; the model may be bent.")
         log.result(_state(reconstruction))
     with log.stage("register"):
         removed = _remove_unsupported(mapper)
@@ -115,8 +125,8 @@ def extract_colors(
 
 def _adjust(
     mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, max_num_iterations: int, function_tolerance: float
-) -> None:
-    """One round on tracks of three views or more, then the filter."""
+) -> float:
+    """One round on tracks of three views or more, then the filter; the share of its cost that the round left."""
     reconstruction = mapper.reconstruction
     bundle = bundle_options(
         options, max_num_iterations=max_num_iterations, function_tolerance=function_tolerance, min_track_length=3
@@ -125,9 +135,11 @@ def _adjust(
     for image_id in sorted(reconstruction.reg_image_ids()):
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
+    summary = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
     mapper.observation_manager.filter_observations_with_negative_depth()
     mapper.observation_manager.filter_all_points3D(MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG)
+    costs = summary.ceres_summary
+    return float(costs.final_cost / costs.initial_cost) if costs.initial_cost > 0 else 1.0
 
 
 def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
