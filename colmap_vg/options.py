@@ -59,7 +59,7 @@ class SolveOptions(_Checked):
     one_dsfm_threshold: float = _number(0.1, 0.0)  # broken weight, mean |projection|
     one_dsfm_num_directions: int = _number(48, 1)
     direction_gate_deg: float = _number(15.0, 0.0, 180.0)  # degrees; robust filter of directions; 0: no gate
-    edge_weights: Literal["unit", "inliers"] = "inliers"  # inliers: sqrt(number), a third for planar pairs
+    edge_weights: Literal["unit", "inliers", "information"] = "information"  # inliers: sqrt(number), planar a third
     accelerate: bool = True  # Anderson acceleration of the outer iterations of 1C, 1O, 2C, 2O; same fixed point
     max_num_iterations: int = _number(1000, 1)  # outer iterations of 1C, 1O, 2C, 2O
     convergence_tolerance: float = _number(1e-6, 0.0, 1.0)  # relative change of positions between outer iterations

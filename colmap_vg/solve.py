@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.edge_weights import edge_weights
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.joint.alternation import solve_joint
@@ -27,9 +28,6 @@ from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-PLANAR_WEIGHT = 1.0 / 3.0
-"""Pairs explained by a homography have less certain poses (seen on real databases: up to 12 and 85 degrees wrong)."""
 
 _BASELINES = {"lud": solve_lud}
 
@@ -79,7 +77,7 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
     average = average_rotations_robust if options.rotation_averaging == "robust" else average_rotations_chordal
     while part.num_images >= 2:
         relative = graph.cam2_from_cam1_rotations[part.edge_rows]
-        result = average(part.num_images, part.edges, relative, _edge_weights(graph, part.edge_rows, options))
+        result = average(part.num_images, part.edges, relative, edge_weights(graph, part.edge_rows, options))
         rotations = result.cam_from_world_rotations
         bad = rotation_residuals(part.edges, relative, rotations) > np.radians(options.rotation_gate_deg)
         if options.rotation_gate_deg == 0.0 or not bad.any():
@@ -104,7 +102,7 @@ def _filter_directions(ledger: Ledger, part: Subgraph, rotations: Array, options
         )
         ledger.drop(rigid.edge_rows[broken > options.one_dsfm_threshold], EdgeVerdict.ONE_DSFM)
     elif options.direction_gate_deg > 0:
-        weights = _edge_weights(ledger.graph, rigid.edge_rows, options)
+        weights = edge_weights(ledger.graph, rigid.edge_rows, options)
         _, angles = robust_direction_residuals(rigid.num_images, rigid.edges, directions, weights)
         ledger.drop(rigid.edge_rows[angles > np.radians(options.direction_gate_deg)], EdgeVerdict.DIRECTION_OUTLIER)
     return ledger.largest_rigid_part(rigid, options.random_seed)
@@ -116,7 +114,7 @@ def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOp
     if method == "epipolar":
         method = "2O"
     directions = _world_directions(graph, part, poses.rotations)
-    weights = _edge_weights(graph, part.edge_rows, options)
+    weights = edge_weights(graph, part.edge_rows, options)
     if method in _BASELINES:
         baseline = _BASELINES[method](n, part.edges, directions, weights)
         ledger.log.extend(baseline.log)
@@ -165,13 +163,3 @@ def _world_directions(graph: ViewGraph, part: Subgraph, rotations: Array) -> Arr
     """``gamma_ij = R_i gamma^l_ij`` with R_i camera to world, (e, 3)."""
     local = graph.cam2_in_cam1_directions[part.edge_rows]
     return np.asarray(np.einsum("kba,kb->ka", rotations[part.edges[:, 0]], local))
-
-
-def _edge_weights(graph: ViewGraph, edge_rows: IntArray, options: SolveOptions) -> Array:
-    """Multipliers of squared residuals, mean 1."""
-    weights = np.ones(len(edge_rows))
-    if options.edge_weights == "inliers" and graph.num_inliers is not None:
-        weights = np.sqrt(np.maximum(graph.num_inliers[edge_rows], 1.0))
-    if options.edge_weights == "inliers" and graph.planar is not None:
-        weights = np.where(graph.planar[edge_rows], PLANAR_WEIGHT, 1.0) * weights
-    return np.asarray(weights / weights.mean()) if len(weights) else weights

@@ -60,6 +60,9 @@ class ViewGraph:
         Pairs explained by a homography; their relative pose is less certain.
     triangulation_angles : (m,) array or None
         Median angle between the rays of an edge's inliers, radians.
+    edge_information : (m, 5, 5) array or None
+        Inverse covariance of each relative pose, radians: rotation in camera 2's frame (3), direction in its tangent
+        plane ``tangent_basis(direction)`` (2).
     inlier_offsets : (m + 1,) int64 array or None
         Inliers of edge k are rows ``inlier_offsets[k]:inlier_offsets[k + 1]`` of the arrays below.
     inlier_bearings1, inlier_bearings2 : (k, 3) array or None
@@ -81,6 +84,7 @@ class ViewGraph:
     read_verdicts: NDArray[np.str_] | None = field(default=None, kw_only=True)
     planar: BoolArray | None = field(default=None, kw_only=True)
     triangulation_angles: Array | None = field(default=None, kw_only=True)
+    edge_information: Array | None = field(default=None, kw_only=True)
     inlier_offsets: IntArray | None = field(default=None, kw_only=True)
     inlier_bearings1: Array | None = field(default=None, kw_only=True)
     inlier_bearings2: Array | None = field(default=None, kw_only=True)
@@ -141,6 +145,7 @@ class ViewGraph:
             "read_verdicts": (m,),
             "planar": (m,),
             "triangulation_angles": (m,),
+            "edge_information": (m, 5, 5),
             "inlier_offsets": (m + 1,),
             "inlier_bearings1": (k, 3),
             "inlier_bearings2": (k, 3),
@@ -197,6 +202,7 @@ _KINDS: dict[str, type] = {
     "read_verdicts": np.str_,
     "planar": np.bool_,
     "triangulation_angles": np.float64,
+    "edge_information": np.float64,
     "inlier_offsets": np.int64,
     "inlier_bearings1": np.float64,
     "inlier_bearings2": np.float64,

@@ -60,7 +60,7 @@ OutlierFilter = Annotated[str, typer.Option("--outlier_filter", metavar="robust|
 RotationGate = Annotated[
     float, typer.Option(*colmap_flags.ROTATION_GATE, help="Degrees; edges further off are dropped; 0: no gate.")
 ]
-EdgeWeights = Annotated[str, typer.Option("--edge_weights", metavar="inliers|unit")]
+EdgeWeights = Annotated[str, typer.Option("--edge_weights", metavar="information|inliers|unit")]
 TrustFocalLengths = Annotated[
     str, typer.Option("--trust_focal_lengths", metavar="auto|always|never", help="Of the database's cameras.")
 ]

@@ -72,6 +72,7 @@ def _graph(tables: DatabaseTables, focals: FocalDecision, options: ReadOptions) 
         read_verdicts=geometry.verdicts,
         planar=geometry.planar,
         triangulation_angles=geometry.angles,
+        edge_information=geometry.information,
         inlier_offsets=segment_subset(offsets, thin),
         inlier_bearings1=bearings1[thin],
         inlier_bearings2=bearings2[thin],

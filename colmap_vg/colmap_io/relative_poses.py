@@ -55,6 +55,8 @@ class PairGeometry:
     directions : (m, 3) array
     angles : (m,) array
         Median triangulation angles, radians.
+    information : (m, 5, 5) array
+        See `RefinedEdges`.
     planar : (m,) bool array
     verdicts : (m,) str array
     """
@@ -62,6 +64,7 @@ class PairGeometry:
     rotations: Array
     directions: Array
     angles: Array
+    information: Array
     planar: BoolArray
     verdicts: NDArray[np.str_]
 
@@ -148,7 +151,9 @@ def relative_poses(
     verdicts[tables.configs == WATERMARK] = EdgeVerdict.WATERMARK
     verdicts[tables.configs == DEGENERATE] = EdgeVerdict.DEGENERATE
     verdicts[np.diff(every.offsets) < min_num_inliers] = EdgeVerdict.FEW_INLIERS
-    return PairGeometry(final.rotations, final.directions, final.median_angles, planar, verdicts.astype(str))
+    return PairGeometry(
+        final.rotations, final.directions, final.median_angles, refined.information, planar, verdicts.astype(str)
+    )
 
 
 def _poses_from_matrices(

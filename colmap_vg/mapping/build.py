@@ -138,7 +138,7 @@ def _adjust(
     summary = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
     mapper.observation_manager.filter_observations_with_negative_depth()
     mapper.observation_manager.filter_all_points3D(MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG)
-    costs = summary.ceres_summary
+    costs = summary.ceres_summary  # type: ignore[attr-defined]  # stubs know the base class only
     return float(costs.final_cost / costs.initial_cost) if costs.initial_cost > 0 else 1.0
 
 
