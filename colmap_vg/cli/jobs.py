@@ -65,12 +65,14 @@ def solve(
     reporter: Reporter,
 ) -> None:
     """The viewing graph only: a model of poses without points."""
+    from colmap_vg.colmap_io.database import check_database
     from colmap_vg.colmap_io.read import read_view_graph
     from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
     from colmap_vg.solve import solve_view_graph
 
     configure_colmap_log(reporter.verbose)
     log = StageLog(reporter.on_event)
+    check_database(database_path)
     refuse_models(output_path, overwrite)
     with log.stage("view graph"):
         graph = read_view_graph(database_path, read)

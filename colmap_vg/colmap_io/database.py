@@ -52,7 +52,7 @@ def check_database(database_path: str | PathLike[str]) -> None:
     Raises
     ------
     DatabaseError
-        As for :func:`reading`; also when there are no images, or no verified pairs.
+        As for :func:`reading`; also when there are no images, no verified pairs, or a rig of several cameras.
     """
     with reading(database_path) as connection:
         (num_images,) = connection.execute("SELECT COUNT(*) FROM images").fetchone()
@@ -64,6 +64,7 @@ def check_database(database_path: str | PathLike[str]) -> None:
                 f"{database_path}: holds {num_images} images but no verified pairs; match them first"
                 " (colmap exhaustive_matcher), or verify the matches (colmap geometric_verifier)"
             )
+        _refuse_rigs(connection, Path(database_path))
 
 
 def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:
@@ -111,3 +112,16 @@ def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
     missing = [name for name in REQUIRED_TABLES if name not in found]
     if missing:
         raise DatabaseError(f"{path}: is no COLMAP database, it has no table {', '.join(missing)}")
+
+
+def _refuse_rigs(connection: sqlite3.Connection, path: Path) -> None:
+    """Setting the pose of one image of a rig moves the others: until rigs are solved as such, none is better."""
+    tables = connection.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'rig_sensors'").fetchone()
+    if tables[0] == 0:  # an older schema
+        return
+    rig = connection.execute("SELECT rig_id, COUNT(*) + 1 FROM rig_sensors GROUP BY rig_id ORDER BY rig_id").fetchone()
+    if rig is not None:
+        raise DatabaseError(
+            f"{path}: rig {rig[0]} has {rig[1]} sensors; rigs are not supported yet: map the images with"
+            " pycolmap.global_mapping, or make the database without a rig"
+        )

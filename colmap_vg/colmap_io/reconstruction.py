@@ -24,27 +24,20 @@ def loaded_cache(
     Raises
     ------
     DatabaseError
-        The copy cannot be made, or a rig has several sensors.
+        The copy cannot be made, or pycolmap cannot read it.
     """
     copy = working_copy(database_path, work_folder)
     try:
-        with pycolmap.Database.open(copy) as database:
-            options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches, load_all_images=True)
-            cache = pycolmap.DatabaseCache.create(database, options)
-        _refuse_rigs(cache)
+        try:
+            with pycolmap.Database.open(copy) as database:
+                options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches, load_all_images=True)
+                cache = pycolmap.DatabaseCache.create(database, options)
+        except (ValueError, RuntimeError, IndexError) as error:
+            raise DatabaseError(f"{database_path}: pycolmap cannot read the database ({error})") from error
         yield cache
     finally:
         for leftover in work_folder.glob(copy.name + "*"):
             leftover.unlink()
-
-
-def _refuse_rigs(cache: "pycolmap.DatabaseCache") -> None:
-    for rig_id, rig in cache.rigs.items():
-        if rig.num_sensors() > 1:
-            raise DatabaseError(
-                f"rig {rig_id} of the database has {rig.num_sensors()} sensors; rigs are not supported yet: map the"
-                " images with pycolmap.global_mapping, or make the database without a rig"
-            )
 
 
 def reconstruction_from_solution(

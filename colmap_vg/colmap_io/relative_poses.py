@@ -118,7 +118,8 @@ def relative_poses(
     every = _Matches(offsets, bearings1, bearings2)
     matches = every.thinned(MAX_MATCHES_PER_POSE)
     cameras = tables.camera_idx[tables.pairs]
-    K = np.stack([calibration_matrix(c, s) for c, s in zip(tables.cameras, focal_scales, strict=True)])
+    K = np.array([calibration_matrix(c, s) for c, s in zip(tables.cameras, focal_scales, strict=True)])
+    K = K.reshape(-1, 3, 3)
     K1, K2 = K[cameras[:, 0]], K[cameras[:, 1]]
     unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
 

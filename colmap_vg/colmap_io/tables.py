@@ -3,6 +3,7 @@
 import sqlite3
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -102,10 +103,13 @@ class _Reader:
                 camera = pycolmap.Camera(
                     camera_id=camera_id, model=pycolmap.CameraModelId(model), width=width, height=height, params=params
                 )
+                fitting = camera.verify_params()
             except (ValueError, TypeError, RuntimeError) as error:
                 raise self._damaged(where, f"camera model {model} is unknown") from error
-            if not camera.verify_params() or not np.isfinite(params).all():
+            if not fitting:
                 raise self._damaged(where, f"its {len(params)} parameters do not fit the model {camera.model_name}")
+            if not np.isfinite(params).all():
+                raise self._damaged(where, f"its parameters are {camera.params_to_string()}")
             if camera.is_spherical():
                 raise DatabaseError(f"{self._path}: {where} is spherical; cut the panoramas into perspective images")
             if camera.mean_focal_length() <= 0:
@@ -115,23 +119,31 @@ class _Reader:
         return found
 
     def images(self, camera_rows: dict[int, int]) -> tuple[IntArray, tuple[str, ...], IntArray]:
-        rows = self._connection.execute("SELECT image_id, name, camera_id FROM images ORDER BY image_id").fetchall()
-        for image_id, name, camera_id in rows:
+        query = "SELECT image_id, CAST(name AS BLOB), camera_id FROM images ORDER BY image_id"
+        ids, names, cameras = [], [], []
+        for image_id, name, camera_id in self._connection.execute(query):
+            where = f"image {image_id}"
+            try:
+                names.append((name or b"").decode("utf-8"))
+            except UnicodeDecodeError as error:
+                raise self._damaged(where, f"its name {name!r} is not UTF-8; rename the file") from error
             if camera_id not in camera_rows:
-                raise self._damaged(f"image {image_id} ({name})", f"it has camera {camera_id}, which does not exist")
-        ids = np.array([r[0] for r in rows], dtype=np.int64)
-        names = tuple(str(r[1]) for r in rows)
-        return ids, names, np.array([camera_rows[r[2]] for r in rows], dtype=np.int64)
+                raise self._damaged(f"{where} ({names[-1]})", f"it has camera {camera_id}, which does not exist")
+            ids.append(image_id)
+            cameras.append(camera_rows[camera_id])
+        return np.array(ids, dtype=np.int64), tuple(names), np.array(cameras, dtype=np.int64)
 
     def keypoints(self, image_ids: IntArray) -> tuple[NDArray[np.float32], ...]:
         found = {int(i): np.zeros((0, 2), dtype=np.float32) for i in image_ids}
         for image_id, rows, cols, blob in self._connection.execute("SELECT image_id, rows, cols, data FROM keypoints"):
             where = f"keypoints of image {image_id}"
-            values = self._values(blob, np.float32, where)
-            if rows < 0 or (rows and cols < 2) or len(values) != rows * cols:
-                raise self._damaged(where, f"{len(values)} values for {rows} rows of {cols}")
-            if image_id in found and rows:
-                found[image_id] = np.asarray(values.reshape(rows, cols)[:, :2], dtype=np.float32)
+            points = self._values(blob, np.float32, where, rows, cols)[:, :2]
+            if len(points) and points.shape[1] < 2:
+                raise self._damaged(where, "they have a single coordinate")
+            if not np.isfinite(points).all():
+                raise self._damaged(where, "they hold NaN or infinite values")
+            if image_id in found and len(points):
+                found[image_id] = points
         return tuple(found[int(i)] for i in image_ids)
 
     def pairs(
@@ -148,20 +160,18 @@ class _Reader:
             f"SELECT pair_id, rows, cols, data, config, {', '.join(matrices)} FROM two_view_geometries"
             " WHERE rows > 0 ORDER BY pair_id"
         ).fetchall()
-        blobs, counts = [], []
-        for pair_id, num, cols, blob, *_ in rows:
-            where = self._pair_name(pair_id)
-            if cols != 2 or not isinstance(blob, bytes) or len(blob) != num * cols * 4:
-                size = len(blob) if isinstance(blob, bytes) else 0
-                raise self._damaged(where, f"its matches hold {size} bytes for {num} rows of {cols}")
-            blobs.append(blob)
-            counts.append(num)
-        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        matches = np.frombuffer(b"".join(blobs), dtype=np.uint32).reshape(-1, 2).astype(np.int64)
+        found = []
+        for pair_id, num, cols, blob, config, *_ in rows:
+            where = f"matches of {self._pair_name(pair_id)}"
+            found.append(self._values(blob, np.uint32, where, num, cols))
+            if cols != 2 or not isinstance(config, int):
+                raise self._damaged(where, f"they have {cols} columns and configuration {config!r}")
+        offsets = np.concatenate([[0], np.cumsum([len(values) for values in found])]).astype(np.int64)
+        matches = np.concatenate([np.zeros((0, 2), dtype=np.uint32), *found]).astype(np.int64)
         pair_ids = np.array([r[0] for r in rows], dtype=np.int64)
         pairs = self._image_rows(pair_ids, image_ids)
         self._check_matches(pairs, pair_ids, offsets, matches, keypoints)
-        quaternions = self._stacked([r[8] for r in rows], 4, pair_ids)
+        quaternions = self._stacked("qvec", [r[8] for r in rows], 4, pair_ids)
         return DatabaseTables(
             cameras,
             image_ids,
@@ -170,21 +180,26 @@ class _Reader:
             keypoints,
             pairs,
             np.array([r[4] for r in rows], dtype=np.int64),
-            self._stacked([r[5] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
-            self._stacked([r[6] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
-            self._stacked([r[7] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            self._stacked("F", [r[5] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            self._stacked("E", [r[6] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            self._stacked("H", [r[7] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
             _rotations_from_wxyz(quaternions),
-            self._stacked([r[9] for r in rows], 3, pair_ids),
+            self._stacked("tvec", [r[9] for r in rows], 3, pair_ids),
             offsets,
             matches,
         )
 
     def _image_rows(self, pair_ids: IntArray, image_ids: IntArray) -> IntArray:
         pairs = np.stack([pair_ids // MAX_NUM_IMAGES, pair_ids % MAX_NUM_IMAGES], axis=1)
-        known = np.isin(pairs, image_ids).all(axis=1) & (pairs[:, 0] != pairs[:, 1])
-        if not known.all():
-            pair = int(pair_ids[np.argmin(known)])
-            raise self._damaged(self._pair_name(pair), "it links an image to itself, or one that does not exist")
+        faults = {
+            "it links an image to itself": pairs[:, 0] == pairs[:, 1],
+            "it links an image that does not exist": ~np.isin(pairs, image_ids).all(axis=1),
+            "its images are not in the order of their ids": pairs[:, 0] > pairs[:, 1],
+            "it stands there twice": np.diff(pair_ids, prepend=-1) == 0,
+        }
+        for what, bad in faults.items():
+            if bad.any():
+                raise self._damaged(self._pair_name(int(pair_ids[np.argmax(bad)])), what)
         return np.searchsorted(image_ids, pairs).astype(np.int64)
 
     def _check_matches(
@@ -207,23 +222,30 @@ class _Reader:
                 f"it uses keypoints {highest[k].tolist()} of images with {num_keypoints[pairs[k]].tolist()} keypoints",
             )
 
-    def _stacked(self, blobs: list[bytes | None], size: int, pair_ids: IntArray) -> Array:
+    def _stacked(self, name: str, blobs: list[object], size: int, pair_ids: IntArray) -> Array:
         out = np.full((len(blobs), size), np.nan)
         for k, blob in enumerate(blobs):
-            if not blob:
-                continue
-            if len(blob) != 8 * size:
-                where = self._pair_name(int(pair_ids[k]))
-                raise self._damaged(where, f"a matrix of its geometry holds {len(blob)} bytes, expected {8 * size}")
-            out[k] = np.frombuffer(blob)
+            where = f"{name} of {self._pair_name(int(pair_ids[k]))}"
+            values = self._values(blob, np.float64, where)
+            if len(values) not in (0, size):
+                raise self._damaged(where, f"it holds {len(values)} values, expected {size}")
+            if len(values):
+                out[k] = values
         return out
 
-    def _values(self, blob: object, kind: type, where: str) -> NDArray[np.generic]:
-        if blob is None:
-            return np.zeros(0, dtype=kind)
+    def _values(
+        self, blob: object, kind: type, where: str, rows: object = None, cols: object = None
+    ) -> NDArray[Any]:
+        """Values of a blob, which may be missing; as rows and columns where the database tells these."""
+        blob = b"" if blob is None else blob
         if not isinstance(blob, bytes) or len(blob) % np.dtype(kind).itemsize:
-            raise self._damaged(where, "its data are cut off")
-        return np.frombuffer(blob, dtype=kind)
+            raise self._damaged(where, f"no whole values of {np.dtype(kind).itemsize} bytes are there")
+        values: NDArray[Any] = np.frombuffer(blob, dtype=kind)
+        if rows is None and cols is None:
+            return values
+        if not isinstance(rows, int) or not isinstance(cols, int) or min(rows, cols) < 0 or len(values) != rows * cols:
+            raise self._damaged(where, f"{len(values)} values are there for {rows} rows of {cols}")
+        return values.reshape(rows, cols)
 
     def _pair_name(self, pair_id: int) -> str:
         return f"pair of images {pair_id // MAX_NUM_IMAGES} and {pair_id % MAX_NUM_IMAGES}"
