@@ -127,6 +127,8 @@ class _Reader:
                 names.append((name or b"").decode("utf-8"))
             except UnicodeDecodeError as error:
                 raise self._damaged(where, f"its name {name!r} is not UTF-8; rename the file") from error
+            if not names[-1]:
+                raise self._damaged(where, "it has no name")
             if camera_id not in camera_rows:
                 raise self._damaged(f"{where} ({names[-1]})", f"it has camera {camera_id}, which does not exist")
             ids.append(image_id)
@@ -233,9 +235,7 @@ class _Reader:
                 out[k] = values
         return out
 
-    def _values(
-        self, blob: object, kind: type, where: str, rows: object = None, cols: object = None
-    ) -> NDArray[Any]:
+    def _values(self, blob: object, kind: type, where: str, rows: object = None, cols: object = None) -> NDArray[Any]:
         """Values of a blob, which may be missing; as rows and columns where the database tells these."""
         blob = b"" if blob is None else blob
         if not isinstance(blob, bytes) or len(blob) % np.dtype(kind).itemsize:
@@ -251,7 +251,7 @@ class _Reader:
         return f"pair of images {pair_id // MAX_NUM_IMAGES} and {pair_id % MAX_NUM_IMAGES}"
 
     def _damaged(self, where: str, what: str) -> DatabaseError:
-        return DatabaseError(f"{self._path}: {where} is damaged: {what}; extract and match these images again")
+        return DatabaseError(f"{self._path}: damaged {where}: {what}; extract and match these images again")
 
 
 def _rotations_from_wxyz(q: Array) -> Array:

@@ -1,0 +1,119 @@
+"""Each damaged row of a database is named, with what is wrong; the file is read only."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic_databases import DAMAGES, changed_copy, make_database, sha256
+
+from colmap_vg.colmap_io.database import check_database
+from colmap_vg.colmap_io.read import read_view_graph
+from colmap_vg.errors import DatabaseError
+from colmap_vg.solution import SolutionStatus
+from colmap_vg.solve import solve_view_graph
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sound") / "database.db"
+    make_database(path, num_images=4, num_points=60)
+    return path
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_row_is_named(sound: Path, tmp_path: Path, damage: str) -> None:
+    statements, words = DAMAGES[damage]
+    path = changed_copy(sound, tmp_path / "damaged.db", *statements)
+    before = sha256(path)
+    with pytest.raises(DatabaseError) as caught:
+        read_view_graph(path)
+    message = str(caught.value)
+    assert message.startswith(str(path)), message
+    for word in words:
+        assert word in message
+    assert sha256(path) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["damaged.db"]
+
+
+def test_the_sound_database_is_read(sound: Path) -> None:
+    assert read_view_graph(sound).num_edges == 6
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_file_that_is_cut_off_is_refused_or_read_but_never_a_crash(sound: Path, tmp_path: Path, share: float) -> None:
+    content = sound.read_bytes()
+    (tmp_path / "cut.db").write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DatabaseError, match=r"cut\.db"):
+        read_view_graph(tmp_path / "cut.db")
+
+
+def test_random_bytes_in_the_file_never_crash(sound: Path, tmp_path: Path) -> None:
+    content = np.frombuffer(sound.read_bytes(), dtype=np.uint8)
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        damaged = content.copy()
+        start = int(rng.integers(16, len(content) - 500))
+        damaged[start : start + 500] = rng.integers(0, 256, 500)
+        path = tmp_path / "noise.db"
+        path.write_bytes(damaged.tobytes())
+        try:
+            graph = read_view_graph(path)
+        except DatabaseError as error:
+            assert str(error).startswith(str(path))  # noqa: PT017
+        else:
+            assert graph.num_images <= 4
+
+
+# Nothing to map: read as it is, refused by the check
+
+
+def test_a_database_without_images_is_an_empty_graph_and_no_job(tmp_path: Path) -> None:
+    pycolmap.Database.open(tmp_path / "new.db").close()
+    graph = read_view_graph(tmp_path / "new.db")
+    assert (graph.num_images, graph.num_edges) == (0, 0)
+    assert solve_view_graph(graph).status == SolutionStatus.UNSOLVABLE
+    with pytest.raises(DatabaseError, match="no images; extract features first"):
+        check_database(tmp_path / "new.db")
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "DELETE FROM two_view_geometries",
+        "UPDATE two_view_geometries SET rows = 0, data = NULL",
+    ],
+)
+def test_images_without_verified_pairs_are_an_edgeless_graph_and_no_job(
+    sound: Path, tmp_path: Path, statement: str
+) -> None:
+    path = changed_copy(sound, tmp_path / "unverified.db", statement)
+    graph = read_view_graph(path)
+    assert (graph.num_images, graph.num_edges) == (4, 0)
+    assert solve_view_graph(graph).status == SolutionStatus.UNSOLVABLE
+    with pytest.raises(DatabaseError, match="4 images but no verified pairs; match them first"):
+        check_database(path)
+
+
+def test_another_sqlite_file_is_no_colmap_database(sound: Path, tmp_path: Path) -> None:
+    path = changed_copy(sound, tmp_path / "other.db", "DROP TABLE keypoints")
+    for read in (read_view_graph, check_database):
+        with pytest.raises(DatabaseError, match="no COLMAP database, it has no table keypoints"):
+            read(path)
+
+
+def test_rigs_are_refused_before_work_starts(tmp_path: Path) -> None:
+    make_database(tmp_path / "rig.db", num_images=6, num_points=40, num_cameras_per_rig=2)
+    with pytest.raises(DatabaseError, match="rig 1 has 2 sensors; rigs are not supported yet"):
+        check_database(tmp_path / "rig.db")
+
+
+def test_what_another_process_has_not_merged_yet_is_read(sound: Path, tmp_path: Path) -> None:
+    """COLMAP writes in WAL mode: rows stand in DATABASE-wal until the last writer closes."""
+    path = changed_copy(sound, tmp_path / "written.db", "PRAGMA journal_mode = WAL")
+    with pycolmap.Database.open(path) as database:
+        database.delete_two_view_geometry(1, 2)
+        before = {p.name: sha256(p) for p in tmp_path.iterdir()}
+        assert "written.db-wal" in before
+        assert read_view_graph(path).num_edges == 5
+        assert {p.name: sha256(p) for p in tmp_path.iterdir()} == before
