@@ -94,12 +94,7 @@ class Ledger:
             moved = centers - centers.mean(axis=0)
             p[part.images] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
         self.drop(np.flatnonzero(self.usable & ~registered[self.graph.edges].all(axis=1)), EdgeVerdict.OUTSIDE)
-        complete = bool(registered.all())
-        status = SolutionStatus.SOLVED if complete else SolutionStatus.PARTIAL
-        message = f"All {n} images are registered." if complete else self._left_out_message()
-        if not converged:
-            status = SolutionStatus.NOT_CONVERGED
-            message += " The iteration limit was reached: raise max_num_iterations, or look for outliers in the graph."
+        status, message = described(self.image_verdicts, converged)
         return PoseSolution(
             image_ids=self.graph.image_ids,
             cam_from_world_rotations=R,
@@ -115,11 +110,23 @@ class Ledger:
             log=tuple(self.log),
         )
 
-    def _left_out_message(self) -> str:
-        words, counts = np.unique(self.image_verdicts.astype(str), return_counts=True)
-        named = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
-        reasons = ", ".join(f"{count} {word}" for word, count in named.items())
-        return f"{sum(named.values())} of {self.graph.num_images} images are left out ({reasons}); see image_verdicts."
+
+def described(image_verdicts: NDArray[np.generic], converged: bool) -> tuple[SolutionStatus, str]:
+    """Status of a solution with some image registered, and the sentence that tells it."""
+    words, counts = np.unique(image_verdicts.astype(str), return_counts=True)
+    left_out = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
+    status, message = SolutionStatus.SOLVED, f"All {len(image_verdicts)} images are registered."
+    if left_out:
+        reasons = ", ".join(f"{count} {word}" for word, count in left_out.items())
+        status, message = (
+            SolutionStatus.PARTIAL,
+            f"{sum(left_out.values())} of {len(image_verdicts)} images are left out",
+        )
+        message += f" ({reasons}); see image_verdicts."
+    if not converged:
+        status = SolutionStatus.NOT_CONVERGED
+        message += " The iteration limit was reached: raise max_num_iterations, or look for outliers in the graph."
+    return status, message
 
 
 def num_cameras(graph: ViewGraph) -> int:

@@ -7,18 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.database import check_database
 from colmap_vg.colmap_io.read import read_with_caveats
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
 from colmap_vg.errors import MappingError
+from colmap_vg.ledger import described
 from colmap_vg.mapping.build import BuildResult, build_model, extract_colors
 from colmap_vg.options import MappingOptions
-from colmap_vg.output_folder import prepare_output, publish_models, refuse_models
+from colmap_vg.output_folder import publish_models, refuse_models, work_folder
 from colmap_vg.solution import PoseSolution
 from colmap_vg.solve import solve_view_graph
 from colmap_vg.stages import StageEvent, StageLog
-from colmap_vg.verdicts import ImageVerdict
+from colmap_vg.verdicts import ImageVerdict, SolutionStatus
 from colmap_vg.view_graph import ViewGraph
 
 
@@ -32,7 +34,7 @@ class MappingResult:
         As written, the largest first.
     graph : ViewGraph
     solution : PoseSolution
-        With the image verdicts of the finished model.
+        With the poses, focal factors and image verdicts of the finished model, in its frame; the rest as solved.
     """
 
     models: dict[int, "pycolmap.Reconstruction"]
@@ -104,44 +106,84 @@ def map_database(
     """
     check_database(database_path)
     refuse_models(output_path, options.overwrite)
-    work = prepare_output(output_path, options.overwrite)
+    with work_folder(output_path, options.overwrite) as work:
+        graph = _read(database_path, options, log)
+        solution = _solve(graph, options, log)
+        if not solution.registered.any():
+            raise MappingError(f"{database_path}: {solution.message}")
+        with log.stage("load"), loaded_cache(database_path, work, options.read.min_num_inliers) as cache:
+            reconstruction = reconstruction_from_solution(cache, solution, graph)
+        result = build_model(cache, reconstruction, options, log)
+        if reconstruction.num_reg_images() < 2 or reconstruction.num_points3D() == 0:
+            raise MappingError(
+                f"{database_path}: {int(solution.registered.sum())} poses were solved, but no three images share points"
+                " at an angle that could fix them; add overlapping photographs, taken from different places"
+            )
+        with log.stage("write"):
+            reconstruction.normalize()
+            if options.extract_colors:
+                extract_colors(reconstruction, image_path, log)
+            staged = work / "0"
+            staged.mkdir(exist_ok=True)
+            reconstruction.write(staged)
+            publish_models([staged], output_path)
+            log.result(str(Path(output_path) / "0"))
+    return MappingResult({0: reconstruction}, graph, _as_in_model(solution, graph, reconstruction, result))
+
+
+def _read(database_path: str | PathLike[str], options: MappingOptions, log: StageLog) -> ViewGraph:
     with log.stage("view graph"):
         read = replace(options.read, num_threads=options.num_threads, random_seed=options.random_seed)
         graph, caveats = read_with_caveats(database_path, read)
         for caveat in caveats:
             log.warn(caveat)
         log.result(f"{graph.num_images} images, {graph.num_edges} pairs, {int(graph.has_rotation.sum())} usable")
+    return graph
+
+
+def _solve(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:
     with log.stage("solve"):
         solve = replace(options.solve, random_seed=options.random_seed)
         if not options.ba_refine_focal_length:
             solve = replace(solve, refine_focal_lengths="never")
         solution = solve_view_graph(graph, solve)
         log.result(solution.message)
-    if not solution.registered.any():
-        raise MappingError(f"{database_path}: {solution.message}")
-    with log.stage("load"), loaded_cache(database_path, work, options.read.min_num_inliers) as cache:
-        reconstruction = reconstruction_from_solution(cache, solution, graph)
-    result = build_model(cache, reconstruction, options, log)
-    if reconstruction.num_reg_images() < 2 or reconstruction.num_points3D() == 0:
-        raise MappingError(
-            f"{database_path}: {int(solution.registered.sum())} poses were solved, but no three images share points at"
-            " an angle that could fix them; add overlapping photographs, taken from different places"
-        )
-    with log.stage("write"):
-        reconstruction.normalize()
-        if options.extract_colors:
-            extract_colors(reconstruction, image_path, log)
-        staged = work / "0"
-        staged.mkdir(exist_ok=True)
-        reconstruction.write(staged)
-        publish_models([staged], output_path)
-        log.result(str(Path(output_path) / "0"))
-    return MappingResult({0: reconstruction}, graph, _with_final_verdicts(solution, result))
+    return solution
 
 
-def _with_final_verdicts(solution: PoseSolution, result: BuildResult) -> PoseSolution:
-    """The solution with the verdicts of images that were added or removed while the model was built."""
+def _as_in_model(
+    solution: PoseSolution, graph: ViewGraph, model: "pycolmap.Reconstruction", result: BuildResult
+) -> PoseSolution:
+    """The solution with the poses, focal lengths and image verdicts of the finished model."""
     words = solution.image_verdicts.astype(object)
     words[np.isin(solution.image_ids, sorted(result.added))] = ImageVerdict.REGISTERED
     words[np.isin(solution.image_ids, sorted(result.removed))] = ImageVerdict.FEW_OBSERVATIONS
-    return replace(solution, image_verdicts=words.astype(str), registered=words == ImageVerdict.REGISTERED)
+    registered = words == ImageVerdict.REGISTERED
+    rotations = np.full_like(solution.cam_from_world_rotations, np.nan)
+    centers = np.full_like(solution.projection_centers, np.nan)
+    for row in np.flatnonzero(registered):
+        image = model.image(int(solution.image_ids[row]))
+        rotations[row] = image.cam_from_world().rotation.matrix()
+        centers[row] = image.projection_center()
+    status, message = described(words, solution.status != SolutionStatus.NOT_CONVERGED)
+    return replace(
+        solution,
+        cam_from_world_rotations=rotations,
+        projection_centers=centers,
+        registered=registered,
+        component=np.where(registered, 0, -1),
+        focal_scales=_focal_scales(solution, graph, model),
+        image_verdicts=words.astype(str),
+        status=status,
+        message=message,
+    )
+
+
+def _focal_scales(solution: PoseSolution, graph: ViewGraph, model: "pycolmap.Reconstruction") -> NDArray[np.float64]:
+    """Factors from the graph's focal lengths to the model's; cameras that are not in the model keep theirs."""
+    scales = solution.focal_scales.copy()
+    if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
+        for row, camera_id in enumerate(graph.camera_ids.tolist()):
+            if model.exists_camera(camera_id):
+                scales[row] = model.camera(camera_id).mean_focal_length() / graph.camera_focal_lengths[row]
+    return scales

@@ -6,7 +6,8 @@ Models are written under ``OUT/.work`` and renamed to ``OUT/0``, ``OUT/1``, ...:
 import re
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 
@@ -48,6 +49,20 @@ def prepare_output(output_path: str | PathLike[str], overwrite: bool = False) ->
             f"cannot write to the output folder {output}: {error.strerror}; choose another --output_path"
         ) from error
     return work
+
+
+@contextmanager
+def work_folder(output_path: str | PathLike[str], overwrite: bool = False) -> Iterator[Path]:
+    """As :func:`prepare_output`; when the job fails, folders that it made and that hold nothing go again."""
+    work = Path(output_path) / WORK_NAME
+    made = [path for path in (work, *work.parents) if not path.exists()]
+    try:
+        yield prepare_output(output_path, overwrite)
+    except BaseException:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
+        raise
 
 
 def refuse_models(output_path: str | PathLike[str], overwrite: bool = False) -> None:

@@ -11,7 +11,7 @@ from colmap_vg.errors import MappingError
 from colmap_vg.image_folder import DATABASE_NAME, make_database
 from colmap_vg.mapper import MappingResult, map_database
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
-from colmap_vg.output_folder import prepare_output, publish_models, refuse_models
+from colmap_vg.output_folder import publish_models, refuse_models, work_folder
 from colmap_vg.stages import StageLog
 
 
@@ -82,8 +82,7 @@ def solve(
         log.result(solution.message)
     if not solution.registered.any():
         raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")
-    with log.stage("write"):
-        work = prepare_output(output_path, overwrite)
+    with log.stage("write"), work_folder(output_path, overwrite) as work:
         staged = work / "0"
         staged.mkdir(exist_ok=True)
         with loaded_cache(database_path, work, read.min_num_inliers) as cache:

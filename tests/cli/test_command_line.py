@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 from rendered_corner import render_corner
+from synthetic_databases import DAMAGES, changed_copy, make_database, sha256
 from typer.testing import CliRunner, Result
 
 from colmap_vg import __version__
@@ -46,6 +47,22 @@ def images_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("corner") / "images"
     render_corner(6).write(folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def small_database_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four images that see the same 60 points."""
+    path = tmp_path_factory.mktemp("small") / "database.db"
+    make_database(path, num_images=4, num_points=60)
+    return path
+
+
+def assert_refused(verb: str, path: Path, output: Path, *words: str) -> None:
+    """One line that names the words, nothing written, nothing changed."""
+    before = {p.name: sha256(p) for p in path.parent.iterdir() if p.is_file()}
+    assert_user_error(invoke(verb, "--database_path", path, "--output_path", output), *words)
+    assert {p.name: sha256(p) for p in path.parent.iterdir() if p.is_file()} == before
+    assert not output.exists()
 
 
 def assert_user_error(result: Result, *words: str) -> None:
@@ -120,30 +137,96 @@ def test_help_and_version() -> None:
 
 
 @pytest.mark.parametrize("verb", ["mapper", "solve"])
-@pytest.mark.parametrize("kind", ["missing", "empty", "text", "folder", "unverified"])
+@pytest.mark.parametrize("kind", ["missing", "empty", "text", "folder", "new"])
 def test_a_bad_database_is_one_clear_line(tmp_path: Path, verb: str, kind: str) -> None:
-    path, output = tmp_path / "database.db", tmp_path / "out"
+    path = tmp_path / "database.db"
     if kind == "empty":
         path.write_bytes(b"")
     elif kind == "text":
         path.write_text("this is no database\n" * 50)
     elif kind == "folder":
         path.mkdir()
-    elif kind == "unverified":
+    elif kind == "new":
         pycolmap.Database.open(path).close()
-    before = path.read_bytes() if path.is_file() else None
-    assert_user_error(invoke(verb, "--database_path", path, "--output_path", output), "database")
-    assert (path.read_bytes() if path.is_file() else None) == before
+    assert_refused(verb, path, tmp_path / "out", "database")
     assert path.exists() == (kind != "missing")
-    assert not list(output.glob("[0-9]*"))
-    assert not (output / "summary.json").exists()
+
+
+@pytest.mark.parametrize("verb", ["mapper", "solve"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_database_is_one_clear_line(
+    tmp_path: Path, small_database_path: Path, verb: str, damage: str
+) -> None:
+    statements, words = DAMAGES[damage]
+    path = changed_copy(small_database_path, tmp_path / "database.db", *statements)
+    assert_refused(verb, path, tmp_path / "new" / "out", str(path), *words)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("verb", ["mapper", "solve"])
+def test_a_database_without_verified_pairs_says_what_to_do(
+    tmp_path: Path, small_database_path: Path, verb: str
+) -> None:
+    path = changed_copy(small_database_path, tmp_path / "database.db", "DELETE FROM two_view_geometries")
+    assert_refused(verb, path, tmp_path / "out", "4 images", "no verified pairs", "match them first")
+
+
+@pytest.mark.parametrize("verb", ["mapper", "solve"])
+def test_a_rig_is_refused(tmp_path: Path, verb: str) -> None:
+    make_database(tmp_path / "database.db", num_images=6, num_points=40, num_cameras_per_rig=2)
+    assert_refused(verb, tmp_path / "database.db", tmp_path / "out", "2 sensors", "rigs are not supported")
+
+
+@pytest.mark.parametrize("verb", ["mapper", "solve"])
+@pytest.mark.parametrize(("num_images", "num_points"), [(2, 60), (4, 12)])
+def test_too_few_images_or_matches_say_what_to_do(tmp_path: Path, verb: str, num_images: int, num_points: int) -> None:
+    make_database(tmp_path / "database.db", num_images=num_images, num_points=num_points)
+    assert_refused(verb, tmp_path / "database.db", tmp_path / "out", "No three images", "add overlapping photographs")
+
+
+def test_missing_photographs_cost_the_colours_only(
+    tmp_path: Path, small_database_path: Path, images_path: Path
+) -> None:
+    """`--image_path` names a folder without them, or one that is not there."""
+    for folder in (images_path, tmp_path / "nowhere"):
+        output = tmp_path / folder.name
+        result = invoke(
+            "mapper", "--database_path", small_database_path, "--output_path", output, "--image_path", folder
+        )  # fmt: skip
+        assert result.exit_code == 0, result.output
+        assert result.stderr == ""
+        model = pycolmap.Reconstruction(output / "0")
+        assert model.num_reg_images() == 4
+        assert all((point.color == 0).all() for point in model.points3D.values())
+        caveats = [line for line in summary(output)["warnings"] if "4 of 4 registered images are not in" in line]
+        assert len(caveats) == 1
+        assert str(folder) in caveats[0]
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("verb", ["mapper", "solve"])
+def test_an_old_database_is_not_migrated(tmp_path: Path, data_folder: Path, verb: str) -> None:
+    """Stored poses are identity and zero, cameras are COLMAP's guesses, the schema is an older one."""
+    path = tmp_path / "source" / "database.db"
+    path.parent.mkdir()
+    path.write_bytes((data_folder / "databases" / "untrusted_relative_poses.db").read_bytes())
+    before = sha256(path)
+    result = invoke(verb, "--database_path", path, "--output_path", tmp_path / "out", "--num_threads", 2)
+    assert result.exit_code == 0, result.output
+    assert sha256(path) == before
+    assert list(path.parent.iterdir()) == [path]
+    content = summary(tmp_path / "out")
+    assert content["images"]["num_images"] == 30
 
 
 @pytest.mark.parametrize("verb", ["mapper", "solve"])
 def test_an_output_below_a_file_is_refused(tmp_path: Path, database_path: Path, verb: str) -> None:
     (tmp_path / "file").write_text("")
+    before = sha256(database_path)
     result = invoke(verb, "--database_path", database_path, "--output_path", tmp_path / "file" / "out")
     assert_user_error(result, "output", "file")
+    assert sha256(database_path) == before
+    assert (tmp_path / "file").read_text() == ""
 
 
 @pytest.mark.parametrize("verb", ["run", "mapper", "solve"])
