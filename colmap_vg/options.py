@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from colmap_vg.errors import OptionError
 
-Method = Literal["epipolar", "1C", "1O", "2C", "2O", "cls", "cross", "orthogonal", "lud", "shapefit", "bata"]
+Method = Literal["epipolar", "1C", "1O", "2C", "2O", "cls", "cle1", "cross", "orthogonal", "lud", "shapefit", "bata"]
 OutlierFilter = Literal["robust", "1dsfm", "none"]
 RotationAveraging = Literal["robust", "chordal"]
 CameraMode = Literal["auto", "single", "per_folder", "per_image"]

@@ -16,10 +16,15 @@ from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.joint.alternation import solve_joint
 from colmap_vg.ledger import Ledger, num_cameras
 from colmap_vg.options import SolveOptions
+from colmap_vg.positions.bata import solve_bata
 from colmap_vg.positions.cls import solve_cls
+from colmap_vg.positions.cross import solve_cross
+from colmap_vg.positions.direct import solve_cle1
 from colmap_vg.positions.direction_filter import robust_direction_residuals
 from colmap_vg.positions.fixed_point import solve_fixed_point
 from colmap_vg.positions.lud import solve_lud
+from colmap_vg.positions.orthogonal import solve_orthogonal
+from colmap_vg.positions.shapefit import solve_shapefit
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.rotations.robust import average_rotations_robust, rotation_residuals
 from colmap_vg.solution import PoseSolution
@@ -29,7 +34,14 @@ from colmap_vg.view_graph import ViewGraph
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_BASELINES = {"lud": solve_lud}
+_BASELINES = {
+    "bata": solve_bata,
+    "cle1": solve_cle1,
+    "cross": solve_cross,
+    "lud": solve_lud,
+    "orthogonal": solve_orthogonal,
+    "shapefit": solve_shapefit,
+}
 
 
 def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> PoseSolution:

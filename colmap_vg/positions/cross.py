@@ -2,8 +2,8 @@
 
 Govindu, CVPR 2001. Each direction asks for ``gamma x (p_j - p_i) = 0``, linear in the positions, so that least squares
 with ``sum ||p||^2 = 1`` is an eigenvector. Its residuals grow with the length of an edge; the weights
-``1 / ||p_j - p_i||^2`` of the last positions turn them into sines of angles. Nothing guarantees that this converges, and a
-sine does not tell a direction from its opposite (the fault of the orthogonal metric, Fig. 4 of Nasiri et al.).
+``1 / ||p_j - p_i||^2`` of the last positions turn them into sines of angles. Nothing guarantees that this converges,
+and a sine does not tell a direction from its opposite (the fault of the orthogonal metric, Fig. 4 of Nasiri et al.).
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_vg.linear.anderson import fixed_point
 from colmap_vg.linear.assembly import BlockPattern
 from colmap_vg.linear.solvers import factorize
-from colmap_vg.positions.result import PositionResult, centered, check_connected, unit_weights
+from colmap_vg.positions.result import PositionResult, check_connected, unit_weights
 from colmap_vg.solution import LogEntry
 
 Array = NDArray[np.float64]

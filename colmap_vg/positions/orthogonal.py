@@ -1,9 +1,10 @@
 """Block coordinate descent for the orthogonal metric: ``min sum w ||gamma - lambda (p_j - p_i)||^2``, lambda free.
 
-The appendix of Nasiri et al. (eq. Crs3). With the best ``lambda = gamma . d / ||d||^2``, ``d = p_j - p_i``, an edge's cost is
-``||gamma x d̂||^2``, so the minimum is that of eq. CLE1 with the orthogonal metric, and no constraint is needed. Two
-closed-form steps alternate: positions at fixed lambda (a scalar Laplacian with weights ``w lambda^2``), lambda at fixed
-positions. The cost never rises. A negative lambda is an edge that points backwards, which this metric does not mind.
+The appendix of Nasiri et al. (eq. Crs3). With ``d = p_j - p_i`` and the best ``lambda = gamma . d / ||d||^2``, an
+edge's cost is ``||gamma x d̂||^2``, so the minimum is that of eq. CLE1 with the orthogonal metric, and no constraint
+is needed. Two closed-form steps alternate: positions at fixed lambda (a scalar Laplacian with weights ``w
+lambda^2``), lambda at fixed positions. The cost never rises. A negative lambda is an edge that points backwards,
+which this metric allows.
 """
 
 import numpy as np
@@ -57,8 +58,8 @@ def solve_orthogonal(
     Returns
     -------
     PositionResult
-        `lambdas` are eq. Crs3's, about ``1 / ||p_j - p_i||``; `cost` is eq. CLE1 with the orthogonal metric. The spread is
-        that of the start: the cost does not depend on it.
+        `lambdas` are eq. Crs3's, about ``1 / ||p_j - p_i||``; `cost` is eq. CLE1 with the orthogonal metric. The
+        spread is that of the start: the cost does not depend on it.
 
     Raises
     ------
