@@ -23,7 +23,7 @@ from colmap_vg.two_view.essential import (
     sampson_errors,
 )
 from colmap_vg.two_view.homography import calibrated_homography, poses_from_homography, pure_rotations
-from colmap_vg.two_view.segments import evenly_thinned, segment_quantiles, segment_subset
+from colmap_vg.two_view.segments import evenly_thinned, segment_of_rows, segment_quantiles, segment_subset, segment_sums
 from colmap_vg.verdicts import EdgeVerdict
 
 Array = NDArray[np.float64]
@@ -40,6 +40,9 @@ MIN_ANGLE = np.radians(0.2)
 """Median triangulation angle below which the direction of a pair says nothing."""
 ROTATION_SHARE = 1.2
 """A pair is a pure rotation when that explains its matches within this factor of the full pose's median error."""
+MIN_FITTING_SHARE, MIN_NUM_FITTING = 0.8, 100
+"""A pair that COLMAP found uncalibrated under a trusted focal length is used where so many of its matches fit a
+calibrated pose: on repeated structure false pairs were seen to reach 74, at shares up to 0.96."""
 MAX_MATCHES_PER_POSE = 1000
 """Matches of a pair that its pose is refined on, evenly over its list."""
 
@@ -79,9 +82,16 @@ class _Matches:
 
     def medians(self, poses: RelativePoses) -> Array:
         """Median Sampson error of each pair, radians; infinite for pairs without matches."""
+        return np.nan_to_num(segment_quantiles(self.offsets, self._errors(poses)), nan=np.inf)
+
+    def shares_within(self, poses: RelativePoses, bounds: Array) -> Array:
+        """Share of each pair's matches with a Sampson error of at most its bound (m,), radians; 0 without matches."""
+        within = self._errors(poses) <= bounds[segment_of_rows(self.offsets)]
+        return segment_sums(self.offsets, within.astype(np.float64)) / np.maximum(np.diff(self.offsets), 1)
+
+    def _errors(self, poses: RelativePoses) -> Array:
         E = essential_from_pose(poses.rotations, poses.directions)
-        error = np.abs(sampson_errors(E, self.offsets, self.bearings1, self.bearings2))
-        return np.nan_to_num(segment_quantiles(self.offsets, error), nan=np.inf)
+        return np.abs(sampson_errors(E, self.offsets, self.bearings1, self.bearings2))
 
     def thinned(self, limit: int) -> "_Matches":
         thin = evenly_thinned(self.offsets, limit)
@@ -148,7 +158,9 @@ def relative_poses(
     verdicts[turned[0] | (tables.configs == PANORAMIC)] = EdgeVerdict.ROTATION_ONLY
     unexplained = (final.share_in_front < MIN_SHARE_IN_FRONT) & (verdicts == EdgeVerdict.KEPT)
     verdicts[unexplained | ((error_px > MAX_MEDIAN_ERROR_PX) & ~turned[0])] = EdgeVerdict.NO_POSE
-    verdicts[(tables.configs == UNCALIBRATED) & focal_trusted[cameras].all(axis=1)] = EdgeVerdict.UNCALIBRATED
+    fitting = matches.shares_within(final, MAX_MEDIAN_ERROR_PX / np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]]))
+    unfit = (fitting < MIN_FITTING_SHARE) | (fitting * np.diff(every.offsets) < MIN_NUM_FITTING)
+    verdicts[(tables.configs == UNCALIBRATED) & focal_trusted[cameras].all(axis=1) & unfit] = EdgeVerdict.UNCALIBRATED
     verdicts[tables.configs == WATERMARK] = EdgeVerdict.WATERMARK
     verdicts[tables.configs == DEGENERATE] = EdgeVerdict.DEGENERATE
     verdicts[np.diff(every.offsets) < min_num_inliers] = EdgeVerdict.FEW_INLIERS

@@ -1,0 +1,80 @@
+"""Photographs with known cameras: models from their databases, held against the truth."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+import colmap_vg
+from colmap_vg import MappingOptions, align_positions, read_view_graph, solve_view_graph, view_graph_mapping
+from colmap_vg.mapping.support import supported_observations
+
+pytestmark = pytest.mark.real_data
+
+GLOBAL_MAPPING_MM = {"fountain-p11": 2.95, "herz-jesus-p25": 5.76, "temple": 1.10, "castle-p19": 28.7}
+"""Mean position errors of pycolmap.global_mapping 4.2.1 on these databases."""
+
+
+def true_centers(folder: Path) -> dict[str, np.ndarray]:
+    rows = [line.split() for line in (folder / "ground_truth.txt").read_text().splitlines() if line.strip()]
+    return {row[0]: np.array(row[-3:], dtype=float) for row in rows if row[0] != "#"}
+
+
+def errors_mm(names: list[str], centers: np.ndarray, truth: dict[str, np.ndarray]) -> np.ndarray:
+    errors, _ = align_positions(centers, np.array([truth[name] for name in names]))
+    return 1e3 * errors
+
+
+@pytest.mark.parametrize("name", GLOBAL_MAPPING_MM)
+def test_models_are_as_accurate_as_those_of_global_mapping(name: str, data_folder: Path, tmp_path: Path) -> None:
+    folder = data_folder / "images" / name
+    before = (folder / "database.db").read_bytes()
+    models = view_graph_mapping(folder / "database.db", None, tmp_path / "out")
+    truth = true_centers(folder)
+    images = [models[0].image(i) for i in sorted(models[0].reg_image_ids())]
+    assert len(images) == len(truth)
+    centers = np.array([image.projection_center() for image in images])
+    errors = errors_mm([image.name for image in images], centers, truth)
+    assert errors.mean() <= 1.05 * GLOBAL_MAPPING_MM[name]
+    assert models[0].compute_mean_reprojection_error() < 1.0
+    assert (folder / "database.db").read_bytes() == before
+
+
+@pytest.mark.parametrize(("name", "bound_mm"), [("fountain-p11", 10.0), ("herz-jesus-p25", 15.0), ("temple", 20.0)])
+def test_the_graph_alone_is_already_close(name: str, bound_mm: float, data_folder: Path) -> None:
+    folder = data_folder / "images" / name
+    graph = read_view_graph(folder / "database.db")
+    solution = solve_view_graph(graph)
+    assert solution.registered.all()
+    assert errors_mm(list(graph.image_names), solution.projection_centers, true_centers(folder)).mean() <= bound_mm
+
+
+@pytest.mark.parametrize(("name", "fewest"), [("lund", 25), ("banana", 15), ("sceaux", 11)])
+def test_no_image_is_registered_that_few_points_fix(name: str, fewest: int, data_folder: Path, tmp_path: Path) -> None:
+    model = view_graph_mapping(data_folder / "images" / name / "database.db", None, tmp_path / "out")[0]
+    support = supported_observations(model, min_angle_deg=1.5)
+    assert len(support) >= fewest
+    assert min(support.values()) >= 15
+
+
+def test_poses_that_nobody_recovered_are_taken_from_the_matches(data_folder: Path, tmp_path: Path) -> None:
+    # Its stored poses are identity and zero, and its cameras have COLMAP's guess of a focal length.
+    path = data_folder / "databases" / "untrusted_relative_poses.db"
+    before = path.read_bytes()
+    model = view_graph_mapping(path, None, tmp_path / "out", MappingOptions(num_threads=2))[0]
+    assert model.num_reg_images() >= 25
+    assert model.compute_mean_reprojection_error() < 1.0
+    assert path.read_bytes() == before
+
+
+def test_the_model_on_disk_is_the_model_returned(data_folder: Path, tmp_path: Path) -> None:
+    database = data_folder / "images" / "fountain-p11" / "database.db"
+    returned = colmap_vg.view_graph_mapping(database, None, tmp_path / "out")[0]
+    written = pycolmap.Reconstruction(tmp_path / "out" / "0")
+    assert written.num_points3D() == returned.num_points3D()
+    for image_id in returned.reg_image_ids():
+        assert written.image(image_id).name == returned.image(image_id).name
+        np.testing.assert_array_equal(
+            written.image(image_id).cam_from_world().matrix(), returned.image(image_id).cam_from_world().matrix()
+        )
