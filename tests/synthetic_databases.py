@@ -21,15 +21,16 @@ def make_database(
     camera: tuple[str, tuple[float, ...]] = PINHOLE,
     has_prior_focal_length: bool = True,
     num_cameras_per_rig: int = 1,
+    camera_per_image: bool = False,
     stored_poses: bool = False,
     seed: int = 1,
 ) -> pycolmap.Reconstruction:
     """Images around a cloud of points, all pairs matched and verified; the truth is returned."""
     pycolmap.set_random_seed(seed)
     options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=1,
+        num_rigs=num_images if camera_per_image else 1,
         num_cameras_per_rig=num_cameras_per_rig,
-        num_frames_per_rig=num_images // num_cameras_per_rig,
+        num_frames_per_rig=1 if camera_per_image else num_images // num_cameras_per_rig,
         num_points3D=num_points,
         camera_model_id=getattr(pycolmap.CameraModelId, camera[0]),
         camera_params=list(camera[1]),
@@ -82,6 +83,68 @@ def angle(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     if A.ndim == 3:
         return 2 * np.arcsin(np.minimum(np.linalg.norm(A - B, axis=(1, 2)) / np.sqrt(8), 1.0))
     return 2 * np.arcsin(np.minimum(np.linalg.norm(A - B, axis=1) / 2, 1.0))
+
+
+def with_other_ids(path: Path, target: Path) -> Path:
+    """A copy with image ids 1003, 1006, ... and camera ids 51, 52, ... in place of 1, 2, ..."""
+    image, camera = "{0} = 1000 + 3 * {0}", "{0} = 50 + {0}"
+    pair = f"pair_id = pair_id + {pair_id(1000, 1000)} + 2 * pair_id"  # pair ids are linear in the image ids
+    return changed_copy(
+        path,
+        target,
+        "PRAGMA foreign_keys = OFF",
+        f"UPDATE images SET {image.format('image_id')}, {camera.format('camera_id')}",
+        f"UPDATE keypoints SET {image.format('image_id')}",
+        f"UPDATE descriptors SET {image.format('image_id')}",
+        f"UPDATE matches SET {pair}",
+        f"UPDATE two_view_geometries SET {pair}",
+        f"UPDATE cameras SET {camera.format('camera_id')}",
+        f"UPDATE rigs SET {camera.format('ref_sensor_id')}",
+        f"UPDATE frame_data SET {image.format('data_id')}, {camera.format('sensor_id')}",
+    )
+
+
+def write_views(
+    path: Path,
+    poses: list[pycolmap.Rigid3d],
+    points: np.ndarray,
+    config: int,
+    noise_px: float = 0.0,
+    has_prior_focal_length: bool = True,
+    seed: int = 0,
+) -> pycolmap.Camera:
+    """A database of given cameras (cam_from_world) that all see the same points, without matrices or stored poses."""
+    rng = np.random.default_rng(seed)
+    camera = pycolmap.Camera(
+        camera_id=1,
+        model="SIMPLE_PINHOLE",
+        width=1024,
+        height=768,
+        params=[1280.0, 512.0, 384.0],
+        has_prior_focal_length=has_prior_focal_length,
+    )
+    matches = np.stack([np.arange(len(points), dtype=np.uint32)] * 2, axis=1)
+    with pycolmap.Database.open(path) as database:
+        database.write_camera(camera, use_camera_id=True)
+        for image_id, pose in enumerate(poses, start=1):
+            image = pycolmap.Image(name=f"{image_id:02d}.jpg", camera_id=1, image_id=image_id)
+            database.write_image(image, use_image_id=True)
+            rays = points @ pose.rotation.matrix().T + pose.translation
+            pixels = camera.img_from_cam(rays) + noise_px * rng.normal(size=(len(points), 2))
+            database.write_keypoints(image_id, pixels.astype(np.float32))
+        for i in range(1, len(poses) + 1):
+            for j in range(i + 1, len(poses) + 1):
+                geometry = pycolmap.TwoViewGeometry(config=config, inlier_matches=matches)
+                database.write_two_view_geometry(i, j, geometry)
+    return camera
+
+
+def look_at(center: np.ndarray, target: np.ndarray) -> pycolmap.Rigid3d:
+    """cam_from_world of a camera at a centre, its axis towards a target, its y axis about downwards (world's +y)."""
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    R = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center)
 
 
 DAMAGES: dict[str, tuple[list[str | tuple[str, tuple[object, ...]]], tuple[str, ...]]] = {

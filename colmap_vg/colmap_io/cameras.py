@@ -35,10 +35,10 @@ def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Arr
     rays[:, :2] = camera.cam_from_img(points)
     valid = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
     rays[~valid] = (0.0, 0.0, 1.0)
-    if not camera.is_undistorted():
-        again = np.asarray(camera.img_from_cam(rays), dtype=float)
-        with np.errstate(invalid="ignore"):
-            valid &= np.abs(again - points).max(axis=1) <= MAX_REPROJECTION_PX
+    # Also without distortion: a fisheye's pixel beyond 90 degrees has no ray in front, and gets a wrong one in silence.
+    again = np.asarray(camera.img_from_cam(rays), dtype=float)
+    with np.errstate(invalid="ignore"):
+        valid &= np.abs(again - points).max(axis=1) <= MAX_REPROJECTION_PX
     return normalized(rays), np.asarray(valid)
 
 
@@ -69,6 +69,8 @@ def with_focal_scale(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camer
 _RADIAL_POWERS: dict[str, tuple[tuple[int, int], ...]] = {
     "SIMPLE_RADIAL": ((3, 2),),
     "RADIAL": ((3, 2), (4, 4)),
+    "SIMPLE_DIVISION": ((3, 2),),
+    "DIVISION": ((4, 2),),
     "OPENCV": ((4, 2), (5, 4), (6, 1), (7, 1)),
     "FULL_OPENCV": ((4, 2), (5, 4), (6, 1), (7, 1), (8, 6), (9, 2), (10, 4), (11, 6)),
 }

@@ -23,7 +23,14 @@ from colmap_vg.two_view.essential import (
     sampson_errors,
 )
 from colmap_vg.two_view.homography import calibrated_homography, poses_from_homography, pure_rotations
-from colmap_vg.two_view.segments import evenly_thinned, segment_of_rows, segment_quantiles, segment_subset, segment_sums
+from colmap_vg.two_view.segments import (
+    evenly_thinned,
+    rows_of_segments,
+    segment_of_rows,
+    segment_quantiles,
+    segment_subset,
+    segment_sums,
+)
 from colmap_vg.verdicts import EdgeVerdict
 
 Array = NDArray[np.float64]
@@ -38,8 +45,14 @@ MAX_MEDIAN_ERROR_PX = 4.0
 """COLMAP's own two-view threshold; a pose whose median match is beyond it explains nothing."""
 MIN_ANGLE = np.radians(0.2)
 """Median triangulation angle below which the direction of a pair says nothing."""
-ROTATION_SHARE = 1.2
-"""A pair is a pure rotation when that explains its matches within this factor of the full pose's median error."""
+MAX_SPURIOUS_ANGLE = np.radians(3.0)
+"""Median triangulation angle that noise alone gives to a pair without baseline, at most."""
+ROTATION_SHARE = 1.3
+"""A pair is a pure rotation when that explains its matches within this factor of what the full pose's median error
+makes one expect; the pose has fitted some of the noise (measured: a factor of 1.05 to 1.25)."""
+ROTATION_NOISE = 2.47
+"""Median error of a rotation over that of an epipolar line for the same noise: sqrt(2) 1.177 (both coordinates of both
+matched points, Rayleigh's median) over 0.6745 (one normal variable)."""
 MIN_FITTING_SHARE, MIN_NUM_FITTING = 0.8, 100
 """A pair that COLMAP found uncalibrated under a trusted focal length is used where so many of its matches fit a
 calibrated pose: on repeated structure false pairs were seen to reach 74, at shares up to 0.96."""
@@ -238,13 +251,14 @@ def _where(mask: BoolArray, one: RelativePoses, other: RelativePoses) -> Relativ
 
 def _pure_rotation(matches: _Matches, poses: RelativePoses) -> tuple[BoolArray, Array]:
     """Which pairs a rotation alone explains about as well, and that rotation."""
-    suspects = poses.median_angles < MIN_ANGLE
-    if not suspects.any():
-        return suspects, poses.rotations
-    found = pure_rotations(matches.offsets, matches.bearings1, matches.bearings2)
-    # A rotation must explain two coordinates of a match, an epipolar line one: sqrt(2) more for the same noise.
-    explained = found.median_errors <= ROTATION_SHARE * np.sqrt(2.0) * np.maximum(matches.medians(poses), 1e-4)
-    return np.asarray(suspects | (explained & (np.diff(matches.offsets) > 0))), found.rotations
+    turned, rotations = poses.median_angles < MIN_ANGLE, poses.rotations.copy()
+    suspects = np.flatnonzero(poses.median_angles < MAX_SPURIOUS_ANGLE)
+    rows, offsets = rows_of_segments(matches.offsets, suspects)
+    found = pure_rotations(offsets, matches.bearings1[rows], matches.bearings2[rows])
+    expected = ROTATION_NOISE * np.maximum(matches.medians(poses)[suspects], 1e-4)
+    turned[suspects] |= found.median_errors <= ROTATION_SHARE * expected
+    rotations[suspects] = found.rotations
+    return turned, rotations
 
 
 def _usable(matrices: Array) -> BoolArray:
