@@ -34,6 +34,9 @@ from colmap_vg.view_graph import ViewGraph
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+TRIAL_SHARE = 0.25
+"""Share of the rotation gate that pairs on trial must keep within: one false pair in 10^5 does, by chance."""
+
 _BASELINES = {
     "bata": solve_bata,
     "cle1": solve_cle1,
@@ -62,6 +65,7 @@ def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> P
     ledger = Ledger(graph)
     part = ledger.largest_component(np.ones(graph.num_images, dtype=bool), ImageVerdict.SMALLER_COMPONENT)
     rotations, part = _average_rotations(ledger, part, options)
+    part = _admit_trials(ledger, part, rotations, options)
     rigid = _filter_directions(ledger, part, rotations, options)
     if rigid.num_images < 3:
         return ledger.unsolvable(
@@ -100,6 +104,18 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
         images[part.images] = True
         part = ledger.largest_component(images, ImageVerdict.CUT_OFF)
     return np.zeros((part.num_images, 3, 3)), part
+
+
+def _admit_trials(ledger: Ledger, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:
+    """The part with those uncalibrated pairs whose rotations the averaged ones confirm: a false pair would by chance."""
+    if options.rotation_gate_deg == 0.0:
+        return part
+    graph, inside = ledger.graph, np.zeros(ledger.graph.num_images, dtype=bool)
+    inside[part.images] = True
+    trials = Subgraph.of(graph.edges, inside, ledger.edge_verdicts == EdgeVerdict.UNCALIBRATED)
+    residuals = rotation_residuals(trials.edges, graph.cam2_from_cam1_rotations[trials.edge_rows], rotations)
+    ledger.restore(trials.edge_rows[residuals <= np.radians(options.rotation_gate_deg * TRIAL_SHARE)])
+    return Subgraph.of(graph.edges, inside, ledger.usable)
 
 
 def _filter_directions(ledger: Ledger, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:
