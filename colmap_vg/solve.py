@@ -107,7 +107,7 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
 
 
 def _admit_trials(ledger: Ledger, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:
-    """The part with those uncalibrated pairs whose rotations the averaged ones confirm: a false pair would by chance."""
+    """The part with those uncalibrated pairs besides whose rotations the averaged ones confirm."""
     if options.rotation_gate_deg == 0.0:
         return part
     graph, inside = ledger.graph, np.zeros(ledger.graph.num_images, dtype=bool)

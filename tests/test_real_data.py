@@ -70,7 +70,7 @@ def test_stored_poses_that_nobody_recovered_are_not_used(data_folder: Path) -> N
     assert graph.num_images == 30
     used = np.flatnonzero(graph.has_direction)
     assert len(used) > 100
-    assert np.median(so3.angle(graph.cam2_from_cam1_rotations[used])) > np.radians(5)
+    assert np.median(so3.angle(graph.cam2_from_cam1_rotations[used])) > np.radians(1)
     E = essential_from_pose(graph.cam2_from_cam1_rotations, graph.cam2_in_cam1_directions)
     errors = sampson_errors(E, graph.inlier_offsets, graph.inlier_bearings1, graph.inlier_bearings2)
     medians = segment_quantiles(graph.inlier_offsets, np.abs(errors))[used]
