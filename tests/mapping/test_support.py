@@ -1,0 +1,74 @@
+"""Counts of supported observations against a twin that looks at every pair of rays."""
+
+from itertools import combinations
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic_databases import PINHOLE
+
+from colmap_vg.mapping.support import supported_observations
+
+
+def brute_force(model: pycolmap.Reconstruction, min_angle_deg: float, min_track_length: int) -> dict[int, int]:
+    counts = dict.fromkeys(model.reg_image_ids(), 0)
+    for point in model.points3D.values():
+        images = [e.image_id for e in point.track.elements]
+        rays = {i: model.image(i).projection_center() - point.xyz for i in images}
+        widest = max(
+            np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+            for a, b in combinations(rays.values(), 2)
+        )
+        if len(images) >= min_track_length and widest >= min_angle_deg:
+            for image_id in images:
+                counts[image_id] += 1
+    return counts
+
+
+def make_model(num_images: int, num_points: int, track_length: int, seed: int) -> pycolmap.Reconstruction:
+    pycolmap.set_random_seed(seed)
+    return pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(
+            num_rigs=1,
+            num_frames_per_rig=num_images,
+            num_points3D=num_points,
+            track_length=track_length,
+            camera_model_id=pycolmap.CameraModelId.SIMPLE_PINHOLE,
+            camera_params=list(PINHOLE[1]),
+        )
+    )
+
+
+@pytest.mark.parametrize("track_length", [2, 3, 5])
+@pytest.mark.parametrize("min_angle_deg", [0.0, 1.5])
+def test_counts_are_those_of_all_pairs_of_rays(track_length: int, min_angle_deg: float) -> None:
+    model = make_model(9, 80, track_length, seed=track_length)
+    assert supported_observations(model, min_angle_deg) == brute_force(model, min_angle_deg, 3)
+    assert supported_observations(model, min_angle_deg, 2) == brute_force(model, min_angle_deg, 2)
+
+
+def test_a_far_point_does_not_count() -> None:
+    """Cameras 8 apart see a point at 8 / tan(angle): between the angle and its half the quick test may say no."""
+    model = make_model(4, 30, -1, seed=1)
+    before = supported_observations(model, 1.5)
+    assert before == dict.fromkeys(range(1, 5), 30)
+    for point_id in sorted(model.points3D)[:10]:
+        point = model.point3D(point_id)
+        point.xyz = point.xyz + np.array([0.0, 0.0, 5000.0])
+    assert supported_observations(model, 1.5) == dict.fromkeys(range(1, 5), 20) == brute_force(model, 1.5, 3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_quick_angle_is_between_half_of_the_widest_and_the_widest(seed: int) -> None:
+    model = make_model(8, 60, 4, seed)
+    for min_angle_deg in (20.0, 60.0, 100.0):
+        quick = supported_observations(model, min_angle_deg)
+        most, least = brute_force(model, min_angle_deg, 3), brute_force(model, 2 * min_angle_deg, 3)
+        assert all(least[i] <= quick[i] <= most[i] for i in quick)
+
+
+def test_a_model_without_points_supports_nobody() -> None:
+    model = make_model(4, 10, -1, seed=1)
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+    assert supported_observations(model, 1.5) == dict.fromkeys(range(1, 5), 0)
