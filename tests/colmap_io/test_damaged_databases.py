@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from synthetic_databases import DAMAGES, changed_copy, make_database, sha256
 
-from colmap_vg.colmap_io.database import check_database
+from colmap_vg.colmap_io.database import check_database, reading
 from colmap_vg.colmap_io.read import read_view_graph
 from colmap_vg.errors import DatabaseError
 from colmap_vg.solution import SolutionStatus
@@ -117,3 +117,10 @@ def test_what_another_process_has_not_merged_yet_is_read(sound: Path, tmp_path: 
         assert "written.db-wal" in before
         assert read_view_graph(path).num_edges == 5
         assert {p.name: sha256(p) for p in tmp_path.iterdir()} == before
+
+
+def test_nothing_appears_beside_a_database_while_it_is_read(sound: Path, tmp_path: Path) -> None:
+    path = changed_copy(sound, tmp_path / "written.db", "PRAGMA journal_mode = WAL")
+    with reading(path) as connection:
+        assert connection.execute("SELECT COUNT(*) FROM images").fetchone() == (4,)
+        assert [p.name for p in tmp_path.iterdir()] == ["written.db"]

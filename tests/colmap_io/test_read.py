@@ -291,6 +291,20 @@ def test_cameras_at_one_place_give_rotations_only(tmp_path: Path, config: int) -
     assert angle(graph.cam2_from_cam1_rotations, R).max() < np.radians(0.1)
 
 
+@pytest.mark.parametrize("noise_px", [0.0, 0.5])
+def test_a_short_baseline_keeps_its_direction(tmp_path: Path, noise_px: float) -> None:
+    """A hundredth of the distance: parallax of some five pixels."""
+    points = 3.0 * np.random.default_rng(5).normal(size=(300, 3)) + np.array([0.0, 0.0, 12.0])
+    centers = np.array([[0.0, 0.0, 0.0], [0.12, 0.0, 0.0], [0.0, 0.12, 0.0]])
+    poses = [look_at(center, np.array([0.2 * k, 0.0, 12.0])) for k, center in enumerate(centers)]
+    write_views(tmp_path / "a.db", poses, points, CALIBRATED, noise_px=noise_px)
+    graph = read_view_graph(tmp_path / "a.db")
+    assert (graph.read_verdicts == EdgeVerdict.KEPT).all()
+    for (i, j), direction in zip(graph.edges, graph.cam2_in_cam1_directions, strict=True):
+        true = poses[i].rotation.matrix() @ (centers[j] - centers[i])
+        assert direction @ true / np.linalg.norm(true) > np.cos(np.radians(1e-2 + 10.0 * noise_px))
+
+
 def test_pairs_of_a_plane_have_the_pose_that_explains_them(tmp_path: Path) -> None:
     rng = np.random.default_rng(6)
     points = np.column_stack([rng.uniform(-2, 2, (200, 2)), np.zeros(200)])

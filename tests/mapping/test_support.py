@@ -48,7 +48,6 @@ def test_counts_are_those_of_all_pairs_of_rays(track_length: int, min_angle_deg:
 
 
 def test_a_far_point_does_not_count() -> None:
-    """Cameras 8 apart see a point at 8 / tan(angle): between the angle and its half the quick test may say no."""
     model = make_model(4, 30, -1, seed=1)
     before = supported_observations(model, 1.5)
     assert before == dict.fromkeys(range(1, 5), 30)
@@ -65,6 +64,17 @@ def test_the_quick_angle_is_between_half_of_the_widest_and_the_widest(seed: int)
         quick = supported_observations(model, min_angle_deg)
         most, least = brute_force(model, min_angle_deg, 3), brute_force(model, 2 * min_angle_deg, 3)
         assert all(least[i] <= quick[i] <= most[i] for i in quick)
+
+
+def test_the_widest_angle_is_found_from_the_middle_of_a_row() -> None:
+    """Three cameras in a row: from the one in the middle only half of the widest angle is seen."""
+    model = make_model(3, 20, -1, seed=1)
+    for image_id, x in ((1, 0.0), (2, -1.0), (3, 1.0)):
+        model.image(image_id).frame.set_cam_from_world(1, pycolmap.Rigid3d(pycolmap.Rotation3d(), [-x, 0.0, 0.0]))
+    for point in model.points3D.values():
+        point.xyz = np.array([0.0, 0.0, 10.0])  # 5.7 degrees on each side
+    assert supported_observations(model, 10.0) == dict.fromkeys(range(1, 4), 20)
+    assert supported_observations(model, 12.0) == dict.fromkeys(range(1, 4), 0)
 
 
 def test_a_model_without_points_supports_nobody() -> None:
