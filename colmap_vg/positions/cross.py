@@ -26,6 +26,8 @@ NUM_VECTORS = 4
 """Vectors iterated together: the error shrinks by the ratio of the first eigenvalue to the fifth."""
 MAX_SOLVES = 50
 EIGENVECTOR_TOLERANCE = 1e-11
+ROUNDING_BELOW = 1e-7
+"""Changes below this that no longer halve are rounding: very unequal weights leave no more digits."""
 
 
 def solve_cross(
@@ -119,13 +121,14 @@ class _SmallestVector:
         damping = DAMPING * float(matrix.diagonal().mean()) * np.tile(np.eye(3), (self._n, 1, 1))
         factor = factorize(self._pattern.assemble(H, H, -H, damping), in_loop=True)
         V = np.linalg.qr(self._vectors)[0]
-        best = V[:, 0]
+        best, change = V[:, 0], np.inf
         for _ in range(MAX_SOLVES):
             V = np.linalg.qr(self._centered(factor.solve(V)))[0]
             _, turn = np.linalg.eigh(V.T @ (matrix @ V))
             V = self._centered(V @ turn)
             last, best = best, V[:, 0]
-            if min(np.linalg.norm(best - last), np.linalg.norm(best + last)) <= EIGENVECTOR_TOLERANCE:
+            last_change, change = change, float(min(np.linalg.norm(best - last), np.linalg.norm(best + last)))
+            if change <= EIGENVECTOR_TOLERANCE or ROUNDING_BELOW > change > 0.5 * last_change:
                 break
         self._vectors = V
         return np.asarray(best.reshape(self._n, 3) / np.linalg.norm(best))

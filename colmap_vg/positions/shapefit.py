@@ -3,8 +3,8 @@
 Hand, Lee & Voroninski 2015; Goldstein et al., ECCV 2016. A second-order cone program, convex: every start ends at the
 same cost. It is solved with its dual, ``max mu`` subject to ``B^T w v = mu B^T gamma``, ``||v|| <= 1``, v across
 gamma (B the incidence of edges). Norms are smoothed, ``s = sqrt(||r||^2 + e^2)``, and Newton's method solves
-``s v = r`` in positions and multipliers together (Chan, Golub & Mulet, SISC 1999), which stays fast as e shrinks with the
-duality gap. The gap is the test of convergence.
+``s v = r`` in positions and multipliers together (Chan, Golub & Mulet, SISC 1999), which stays fast as e shrinks with
+the duality gap. The gap is the test of convergence.
 """
 
 import numpy as np
