@@ -147,6 +147,31 @@ def look_at(center: np.ndarray, target: np.ndarray) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center)
 
 
+def two_view_tracks_only(path: Path, image_id: int) -> None:
+    """Give an image its own keypoints for each of its pairs, so that no point of it is seen by a third image."""
+    with pycolmap.Database.open(path) as database:
+        others = [image.image_id for image in database.read_all_images() if image.image_id != image_id]
+        keypoints = database.read_keypoints(image_id)
+        per_pair = len(keypoints) // len(others)
+        for slot, other in enumerate(others):
+            i, j = sorted((image_id, other))
+            column = 0 if i == image_id else 1
+            geometry = database.read_two_view_geometry(i, j)
+            matches = geometry.inlier_matches
+            own = np.arange(slot * per_pair, (slot + 1) * per_pair)
+            geometry.inlier_matches = matches[np.isin(matches[:, column], own)]
+            database.update_two_view_geometry(i, j, geometry)
+            # What the other image's keypoint shares with third images is cut as well.
+            used = geometry.inlier_matches[:, 1 - column]
+            for third in others:
+                if third != other:
+                    a, b = sorted((other, third))
+                    pair = database.read_two_view_geometry(a, b)
+                    keep = ~np.isin(pair.inlier_matches[:, 0 if a == other else 1], used)
+                    pair.inlier_matches = pair.inlier_matches[keep]
+                    database.update_two_view_geometry(a, b, pair)
+
+
 DAMAGES: dict[str, tuple[list[str | tuple[str, tuple[object, ...]]], tuple[str, ...]]] = {
     "keypoints cut off": (["UPDATE keypoints SET data = x'00' WHERE image_id = 2"], ("keypoints of image 2",)),
     "keypoints of wrong length": (

@@ -5,7 +5,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from synthetic_databases import PINHOLE, centers, changed_copy, make_database, pair_id, sha256, with_other_ids
+from synthetic_databases import (
+    PINHOLE,
+    centers,
+    changed_copy,
+    make_database,
+    pair_id,
+    sha256,
+    two_view_tracks_only,
+    with_other_ids,
+)
 
 from colmap_vg import mapper
 from colmap_vg.colmap_io.database import check_database
@@ -177,31 +186,6 @@ def test_an_image_without_a_usable_pair_is_registered_by_its_points(
     assert result.solution.status == SolutionStatus.SOLVED
     errors, _ = align_positions(centers(model, ids), centers(truth, ids))
     assert errors.max() < 10 * 0.5 / 1280 * 7 / np.sqrt(200) * 2
-
-
-def two_view_tracks_only(path: Path, image_id: int) -> None:
-    """Give an image its own keypoints for each of its pairs, so that no point of it is seen by a third image."""
-    with pycolmap.Database.open(path) as database:
-        others = [image.image_id for image in database.read_all_images() if image.image_id != image_id]
-        keypoints = database.read_keypoints(image_id)
-        per_pair = len(keypoints) // len(others)
-        for slot, other in enumerate(others):
-            i, j = sorted((image_id, other))
-            column = 0 if i == image_id else 1
-            geometry = database.read_two_view_geometry(i, j)
-            matches = geometry.inlier_matches
-            own = np.arange(slot * per_pair, (slot + 1) * per_pair)
-            geometry.inlier_matches = matches[np.isin(matches[:, column], own)]
-            database.update_two_view_geometry(i, j, geometry)
-            # What the other image's keypoint shares with third images is cut as well.
-            used = geometry.inlier_matches[:, 1 - column]
-            for third in others:
-                if third != other:
-                    a, b = sorted((other, third))
-                    pair = database.read_two_view_geometry(a, b)
-                    keep = ~np.isin(pair.inlier_matches[:, 0 if a == other else 1], used)
-                    pair.inlier_matches = pair.inlier_matches[keep]
-                    database.update_two_view_geometry(a, b, pair)
 
 
 def test_an_image_that_hangs_on_two_view_tracks_is_left_out_with_its_reason(tmp_path: Path) -> None:

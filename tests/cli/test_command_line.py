@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 from rendered_corner import render_corner
-from synthetic_databases import DAMAGES, changed_copy, make_database, sha256
+from synthetic_databases import DAMAGES, changed_copy, make_database, sha256, two_view_tracks_only
 from typer.testing import CliRunner, Result
 
 from colmap_vg import __version__
@@ -182,6 +182,20 @@ def test_a_rig_is_refused(tmp_path: Path, verb: str) -> None:
 def test_too_few_images_or_matches_say_what_to_do(tmp_path: Path, verb: str, num_images: int, num_points: int) -> None:
     make_database(tmp_path / "database.db", num_images=num_images, num_points=num_points)
     assert_refused(verb, tmp_path / "database.db", tmp_path / "out", "No three images", "add overlapping photographs")
+
+
+def test_an_error_after_colmaps_own_work_is_still_the_only_line(tmp_path: Path) -> None:
+    """In a process of its own: what C++ writes to standard error passes CliRunner by."""
+    make_database(tmp_path / "database.db", num_images=4, num_points=200, noise_px=0.3)
+    for image_id in range(1, 5):
+        two_view_tracks_only(tmp_path / "database.db", image_id)
+    arguments = ["mapper", "--database_path", tmp_path / "database.db", "--output_path", tmp_path / "out"]
+    done = subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.splitlines()) == 1
+    assert "add overlapping photographs" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_missing_photographs_cost_the_colours_only(
