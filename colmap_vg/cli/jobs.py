@@ -112,7 +112,7 @@ def demo(
     from colmap_vg.demo import run_demo
 
     configure_colmap_log(reporter.verbose)
-    comparison = run_demo(
+    comparison, mapped = run_demo(
         output_path,
         num_images=num_images,
         seed=seed,
@@ -121,8 +121,15 @@ def demo(
         on_event=reporter.on_event,
     )
     asked = {"output_path": output_path, "num_images": num_images, "seed": seed, "num_threads": num_threads}
-    content = job_summary("demo", {**asked, "overwrite": overwrite, "resume": resume}, reporter)
-    write_summary(output_path, {**content, "comparison": plain(comparison)})
+    _finish(
+        "demo",
+        {**asked, "overwrite": overwrite, "resume": resume},
+        mapped,
+        output_path,
+        reporter,
+        further={"comparison": plain(comparison)},
+    )
+    reporter.say(comparison.summary)
 
 
 def _finish(
@@ -131,9 +138,11 @@ def _finish(
     mapped: MappingResult,
     output_path: Path,
     reporter: Reporter,
-    skipped: Mapping[str, str],
+    skipped: Mapping[str, str] | None = None,
+    further: Mapping[str, object] | None = None,
 ) -> None:
     """Write the summary of a mapping job, and say what came out."""
+    skipped = skipped or {}
     names, solution = mapped.graph.image_names, mapped.solution
     content = job_summary(verb, asked, reporter)
     content["status"] = str(solution.status)
@@ -144,7 +153,7 @@ def _finish(
     )
     content["edges"] = edge_summary(solution.edge_verdicts.tolist(), solution.edge_kept.tolist())
     content["models"] = [model_summary(output_path / str(index), model) for index, model in mapped.models.items()]
-    write_summary(output_path, content)
+    write_summary(output_path, {**content, **(further or {})})
     for index, model in mapped.models.items():
         size = f"{model.num_reg_images()} of {len(names)} images, {model.num_points3D()} points"
         error = f"mean reprojection error {model.compute_mean_reprojection_error():.2f} px"

@@ -1,1 +1,149 @@
-"""A rendered scene with known cameras, from photographs to model."""
+"""The demo: photographs rendered from known cameras, reconstructed with nothing else known, compared with the truth."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from colmap_vg.demo.photographs import RING_RADIUS, TrueCameras, render_photographs, write_truth
+from colmap_vg.errors import OptionError, OutputError
+from colmap_vg.geometry import so3
+from colmap_vg.geometry.similarity import align_positions
+from colmap_vg.image_folder import DATABASE_NAME, make_database
+from colmap_vg.mapper import MappingResult, map_database
+from colmap_vg.options import FeatureOptions, MappingOptions
+from colmap_vg.output_folder import work_folder
+from colmap_vg.stages import StageEvent, StageLog
+
+__all__ = ["DemoResult", "render_photographs", "run_demo"]
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """The model held against the cameras that the photographs were rendered from, after the best similarity.
+
+    Attributes
+    ----------
+    num_images, num_registered : int
+    ring_radius_m : float
+        Metres, of the circle around which the cameras stand.
+    mean_position_error_m, max_position_error_m : float
+        Metres, over registered images.
+    mean_position_error_share : float
+        Of the ring's radius.
+    mean_rotation_error_deg : float
+        Degrees.
+    focal_error_share : float
+        Median found over true focal length, less 1.
+    """
+
+    num_images: int
+    num_registered: int
+    ring_radius_m: float
+    mean_position_error_m: float
+    max_position_error_m: float
+    mean_position_error_share: float
+    mean_rotation_error_deg: float
+    focal_error_share: float
+
+    @property
+    def summary(self) -> str:
+        """The comparison in a sentence."""
+        return (
+            f"{self.num_registered} of {self.num_images} images registered; against the true cameras: mean position"
+            f" error {1e3 * self.mean_position_error_m:.1f} mm ({self.mean_position_error_share:.3%} of the ring's"
+            f" radius), mean rotation error {self.mean_rotation_error_deg:.3f} deg,"
+            f" focal length {self.focal_error_share:+.2%}"
+        )
+
+
+def run_demo(
+    output_path: str | PathLike[str],
+    *,
+    num_images: int = 24,
+    seed: int = 0,
+    num_threads: int = -1,
+    overwrite: bool = False,
+    on_event: Callable[[StageEvent], None] | None = None,
+) -> tuple[DemoResult, MappingResult]:
+    """Render photographs, reconstruct them, and compare the model with the truth.
+
+    Parameters
+    ----------
+    output_path : path
+        Receives ``images``, ``truth.txt``, ``database.db`` and the model ``0``.
+    num_images : int
+        At least 8: with fewer, neighbours on the ring see the scene from too far apart to be matched.
+    seed : int
+        Of the scene, the cameras, the noise, and the reconstruction.
+    num_threads : int
+        -1: all cores.
+    overwrite : bool
+        Replace what an earlier demo left in the output.
+    on_event : callable, optional
+        Called with a `StageEvent` whenever a stage starts, gets on, ends, or has something to warn of.
+
+    Returns
+    -------
+    DemoResult, MappingResult
+
+    Raises
+    ------
+    OptionError
+        Too few images.
+    ColmapVgError
+        As for `image_folder_mapping`; and where open3d cannot be loaded.
+    """
+    if num_images < 8:
+        raise OptionError(f"the demo needs 8 images or more around its scene, asked for {num_images}")
+    output, log = Path(output_path), StageLog(on_event)
+    image_path = output / "images"
+    with work_folder(output, overwrite) as work:
+        if image_path.exists() and not overwrite:
+            raise OutputError(f"{image_path} exists: choose another --output_path, or replace it with --overwrite")
+        rendered = work / "images"
+        shutil.rmtree(rendered, ignore_errors=True)
+        rendered.mkdir()
+        with log.stage("render"):
+            cameras = render_photographs(
+                rendered,
+                num_images=num_images,
+                seed=seed,
+                on_image=lambda done: log.progress(f"{done} of {num_images} photographs", done / num_images),
+            )
+            write_truth(output / "truth.txt", cameras)
+            shutil.rmtree(image_path, ignore_errors=True)
+            rendered.rename(image_path)
+            log.result(f"{num_images} photographs in {image_path}")
+    features = FeatureOptions(num_threads=num_threads, random_seed=seed)
+    make_database(image_path, output, features, log, overwrite=overwrite)
+    options = MappingOptions(num_threads=num_threads, random_seed=seed, overwrite=overwrite)
+    mapped = map_database(output / DATABASE_NAME, image_path, output, options, log)
+    return compared(mapped.models[0], cameras), mapped
+
+
+def compared(model: "pycolmap.Reconstruction", cameras: TrueCameras) -> DemoResult:
+    """Errors of a model's cameras after the similarity that best maps their positions on the true ones."""
+    row_of = {name: row for row, name in enumerate(cameras.names)}
+    images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
+    rows = [row_of[image.name] for image in images]
+    errors, similarity = align_positions(
+        np.array([image.projection_center() for image in images]), cameras.centers[rows]
+    )
+    rotations = np.array([image.cam_from_world().rotation.matrix() for image in images]) @ similarity.rotation.T
+    turned = so3.angle(rotations @ np.swapaxes(cameras.rotations[rows], 1, 2))
+    focals = [model.camera(image.camera_id).mean_focal_length() for image in images]
+    return DemoResult(
+        num_images=len(cameras.names),
+        num_registered=len(images),
+        ring_radius_m=RING_RADIUS,
+        mean_position_error_m=float(errors.mean()),
+        max_position_error_m=float(errors.max()),
+        mean_position_error_share=float(errors.mean() / RING_RADIUS),
+        mean_rotation_error_deg=float(np.degrees(turned.mean())),
+        focal_error_share=float(np.median(focals) / cameras.camera.mean_focal_length() - 1.0),
+    )

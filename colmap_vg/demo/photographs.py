@@ -1,0 +1,115 @@
+"""A folder of rendered photographs, and the cameras that they were taken with."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.demo.exif import with_focal_length
+from colmap_vg.demo.render import RayCaster, photograph, pixel_rays
+from colmap_vg.demo.scene import build_ruin
+from colmap_vg.demo.texture import paint
+from colmap_vg.synthetic import look_at
+
+Array = NDArray[np.float64]
+
+RING_RADIUS = 4.0
+"""Metres, of the circle around which the cameras stand."""
+_WIDTH, _HEIGHT = 800, 600
+_FOCAL_35MM = 40.3  # millimetres; EXIF holds whole ones
+_RADIAL = -0.06
+
+
+@dataclass(frozen=True, eq=False)
+class TrueCameras:
+    """What the photographs were taken with.
+
+    Attributes
+    ----------
+    names : tuple of str
+        File names.
+    rotations : (n, 3, 3) array
+        cam_from_world.
+    centers : (n, 3) array
+        Projection centres, metres.
+    camera : pycolmap.Camera
+    """
+
+    names: tuple[str, ...]
+    rotations: Array
+    centers: Array
+    camera: "pycolmap.Camera"
+
+
+def true_camera() -> "pycolmap.Camera":
+    """The camera of the demo: 800 x 600 pixels, a radial term, a principal point off the middle."""
+    focal = _FOCAL_35MM / 35.0 * max(_WIDTH, _HEIGHT)  # COLMAP's reading of the EXIF field
+    params = [focal, _WIDTH / 2 + 1.5, _HEIGHT / 2 - 1.0, _RADIAL]
+    return pycolmap.Camera(model="SIMPLE_RADIAL", width=_WIDTH, height=_HEIGHT, params=params)
+
+
+def camera_ring(num_images: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Cameras by hand around the scene: cam_from_world rotations (n, 3, 3) and centres (n, 3)."""
+    angle = 2 * np.pi * (np.arange(num_images) + rng.uniform(-0.15, 0.15, num_images)) / num_images
+    radius = RING_RADIUS * rng.uniform(0.94, 1.06, num_images)
+    height = rng.uniform(1.2, 2.2, num_images)
+    centers = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    targets = np.array([0.0, 0.0, 0.45]) + rng.uniform(-0.15, 0.15, (num_images, 3))
+    return look_at(centers, targets), centers
+
+
+def render_photographs(
+    image_path: Path,
+    *,
+    num_images: int = 24,
+    seed: int = 0,
+    on_image: Callable[[int], None] | None = None,
+) -> TrueCameras:
+    """Render a scene into JPEG files with EXIF.
+
+    Parameters
+    ----------
+    image_path : Path
+        An existing folder.
+    num_images : int
+    seed : int
+        Of the scene, the cameras and the noise.
+    on_image : callable, optional
+        Called with the number of photographs that are done.
+
+    Returns
+    -------
+    TrueCameras
+    """
+    import cv2
+
+    scene_rng, ring_rng, *image_rngs = np.random.default_rng(seed).spawn(2 + num_images)
+    caster = RayCaster(paint(build_ruin(scene_rng), scene_rng))
+    rotations, centers = camera_ring(num_images, ring_rng)
+    camera = true_camera()
+    rays = pixel_rays(camera)
+    names = tuple(f"{k:04d}.jpg" for k in range(num_images))
+    for k, name in enumerate(names):
+        pixels = photograph(caster, rays, rotations[k], centers[k], image_rngs[k])
+        _, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 93])
+        exif = with_focal_length(jpeg.tobytes(), "colmap_vg", "demo", _FOCAL_35MM / 5.6, round(_FOCAL_35MM))
+        (image_path / name).write_bytes(exif)
+        if on_image is not None:
+            on_image(k + 1)
+    return TrueCameras(names, rotations, centers, camera)
+
+
+def write_truth(path: Path, cameras: TrueCameras) -> None:
+    """Write a line for each image: name, cam_from_world quaternion (x y z w) and translation, projection centre."""
+    lines = [
+        "# name  qx qy qz qw  tx ty tz (cam_from_world)  cx cy cz (projection centre, metres)",
+        f"# camera {cameras.camera.model_name} {cameras.camera.width} {cameras.camera.height} "
+        + " ".join(f"{value:.10g}" for value in cameras.camera.params),
+    ]
+    for name, R, center in zip(cameras.names, cameras.rotations, cameras.centers, strict=True):
+        values = [*pycolmap.Rotation3d(R).quat, *(-R @ center), *center]
+        lines.append(" ".join([name, *(f"{value:.10g}" for value in values)]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
