@@ -22,6 +22,8 @@ IntArray = NDArray[np.int64]
 
 MIN_RELATIVE_LENGTH = 1e-8
 """Edges shorter than this share of the spread count as this long: lambda stays finite."""
+COST_ROUNDING = 1e-11
+"""Relative differences of costs below this are rounding."""
 
 
 def solve_orthogonal(
@@ -78,7 +80,7 @@ def solve_orthogonal(
 
     def descend(p: Array) -> Array:
         # A guess of the acceleration that climbs is put back to the last point of the descent.
-        if sine_cost(p, edges, gamma, w) > sine_cost(last[0], edges, gamma, w):
+        if sine_cost(p, edges, gamma, w) > (1.0 + COST_ROUNDING) * sine_cost(last[0], edges, gamma, w):
             p = last[0]
         scales = best_scales(p, edges, gamma, size)
         new = centered(system.factor(w * scales**2).solve(system.right_side(w * scales, gamma)))

@@ -1,0 +1,70 @@
+"""BATA: its objective, its stationary points and its robustness."""
+
+import numpy as np
+import pytest
+from position_problems import ring_problem
+
+from colmap_vg import align_positions
+from colmap_vg.positions.bata import ROBUST_SCALE, solve_bata
+from colmap_vg.positions.cls import solve_cls
+
+
+def _objective(problem, p, weights):
+    """Angle by angle: Cauchy's loss of the sine up to 90 degrees, of 1 beyond."""
+    total = 0.0
+    for k, (i, j) in enumerate(problem.edges):
+        d = p[j] - p[i]
+        cosine = d @ problem.directions[k] / np.linalg.norm(d)
+        squared = 1.0 - cosine**2 if cosine > 0 else 1.0
+        total += weights[k] * ROBUST_SCALE**2 * np.log1p(squared / ROBUST_SCALE**2)
+    return total
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_result_is_a_minimum_of_the_robust_sines(seed):
+    problem = ring_problem(15, 6, direction_sigma=0.05, seed=seed)
+    weights = np.random.default_rng(seed).uniform(0.3, 2.0, len(problem.edges))
+    result = solve_bata(*problem.measured, weights, tolerance=1e-11)
+    p = result.projection_centers
+    assert result.converged
+    assert result.cost == pytest.approx(_objective(problem, p, weights), rel=1e-9)
+    step = 1e-5 * np.abs(p).max()
+    for row in range(0, 15, 4):
+        for axis in range(3):
+            move = np.zeros_like(p)
+            move[row, axis] = step
+            up, down = (_objective(problem, p + sign * move, weights) for sign in (1, -1))
+            assert abs(up - down) < 1e-3 * (up + down - 2.0 * result.cost), "the lowest point of a parabola"
+
+
+def test_long_and_short_baselines_weigh_the_same():
+    # An edge's cost depends on its angle alone: CLS, from the same directions, is drawn by the long ones.
+    problem = ring_problem(20, 6, direction_sigma=0.05, seed=2)
+    a = solve_bata(*problem.measured)
+    lengths = np.linalg.norm(np.diff(a.projection_centers[problem.edges], axis=1)[:, 0], axis=1)
+    inside = np.isfinite(a.lambdas)
+    assert np.abs(a.lambdas[inside] / lengths[inside] - 1.0).max() < 0.1
+
+
+def test_outliers_are_outvoted():
+    problem = ring_problem(120, 12, direction_sigma=0.02, outlier_share=0.2, seed=1)
+    robust = align_positions(solve_bata(*problem.measured).projection_centers, problem.centers)[0]
+    squares = align_positions(solve_cls(*problem.measured).projection_centers, problem.centers)[0]
+    assert np.median(robust) < 0.02 * 4.0
+    assert np.median(robust) < 0.1 * np.median(squares)
+
+
+def test_backward_edges_have_no_length():
+    problem = ring_problem(40, 8)
+    problem.directions[3] *= -1.0
+    result = solve_bata(*problem.measured)
+    assert np.isinf(result.lambdas[3])
+    assert np.isfinite(np.delete(result.lambdas, 3)).all()
+    assert align_positions(result.projection_centers, problem.centers)[0].max() < 1e-4
+
+
+def test_gauge():
+    problem = ring_problem(30, 6, direction_sigma=0.05)
+    p = solve_bata(*problem.measured).projection_centers
+    d = p[problem.edges[:, 1]] - p[problem.edges[:, 0]]
+    assert np.sum(d * problem.directions) == pytest.approx(len(d), rel=1e-12)

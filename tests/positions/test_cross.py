@@ -1,0 +1,59 @@
+"""Cross against a dense twin with numpy's eigenvectors."""
+
+import numpy as np
+import pytest
+from position_problems import ring_problem
+
+from colmap_vg.geometry import so3
+from colmap_vg.positions.cross import solve_cross
+
+
+def _rows(problem):
+    """The linear system ``gamma x (p_j - p_i)``: (m, 3, 3 n)."""
+    n, m = problem.num_images, len(problem.edges)
+    A = np.zeros((m, 3, 3 * n))
+    for k, (i, j) in enumerate(problem.edges):
+        A[k, :, 3 * j : 3 * j + 3] = so3.hat(problem.directions[k])
+        A[k, :, 3 * i : 3 * i + 3] = -so3.hat(problem.directions[k])
+    return A
+
+
+def _twin(problem, weights, num_iterations):
+    """Right singular vector of the smallest singular value orthogonal to the translations, reweighted."""
+    n, (i, j) = problem.num_images, problem.edges.T
+    centered = np.linalg.svd(np.kron(np.ones((1, n)), np.eye(3)))[2][3:].T
+    A, lengths = _rows(problem), np.ones(len(i))
+    for _ in range(num_iterations):
+        scaled = (np.sqrt(weights) / lengths)[:, None, None] * A
+        p = (centered @ np.linalg.svd(scaled.reshape(-1, 3 * n) @ centered)[2][-1]).reshape(n, 3)
+        lengths = np.linalg.norm(p[j] - p[i], axis=1)
+    ahead = np.sum(weights * np.sign(np.sum(problem.directions * (p[j] - p[i]), axis=1)))
+    return p * np.sign(ahead)
+
+
+@pytest.mark.parametrize("num_reweightings", [1, 3, 100])
+def test_same_as_the_dense_twin(num_reweightings):
+    problem = ring_problem(20, 6, direction_sigma=0.08, seed=3)
+    weights = np.random.default_rng(0).uniform(0.3, 2.0, len(problem.edges))
+    result = solve_cross(*problem.measured, weights, max_num_iterations=num_reweightings, tolerance=1e-10)
+    expected = _twin(problem, weights, num_reweightings + 1)
+    assert np.abs(result.projection_centers - expected).max() < 1e-7
+    assert result.converged == (num_reweightings == 100)
+
+
+def test_cost_is_the_sum_of_squared_sines():
+    problem = ring_problem(15, 5, direction_sigma=0.1)
+    result = solve_cross(*problem.measured)
+    i, j = problem.edges.T
+    d = result.projection_centers[j] - result.projection_centers[i]
+    cosine = np.sum(d * problem.directions, axis=1) / np.linalg.norm(d, axis=1)
+    assert result.cost == pytest.approx(np.sum(1.0 - cosine**2), rel=1e-9)
+    assert np.linalg.norm(result.projection_centers) == pytest.approx(1.0, rel=1e-12)
+
+
+def test_sparse_factors_find_the_same_vector():
+    # More than 600 unknowns: SuperLU instead of LAPACK. Noise-free, the truth is the null vector.
+    problem = ring_problem(260, 8)
+    result = solve_cross(*problem.measured)
+    truth = problem.centers - problem.centers.mean(axis=0)
+    assert np.abs(result.projection_centers - truth / np.linalg.norm(truth)).max() < 1e-9
