@@ -77,7 +77,7 @@ def run_demo(
     output_path : path
         Receives ``images``, ``truth.txt``, ``database.db`` and the model ``0``.
     num_images : int
-        At least 8: with fewer, neighbours on the ring see the scene from too far apart to be matched.
+        At least 3.
     seed : int
         Of the scene, the cameras, the noise, and the reconstruction.
     num_threads : int
@@ -98,8 +98,8 @@ def run_demo(
     ColmapVgError
         As for `image_folder_mapping`; and where open3d cannot be loaded.
     """
-    if num_images < 8:
-        raise OptionError(f"the demo needs 8 images or more around its scene, asked for {num_images}")
+    if num_images < 3:
+        raise OptionError(f"num_images is {num_images}: a model needs 3 images or more")
     output, log = Path(output_path), StageLog(on_event)
     image_path = output / "images"
     with work_folder(output, overwrite) as work:

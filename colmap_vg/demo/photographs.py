@@ -21,6 +21,7 @@ RING_RADIUS = 4.0
 _WIDTH, _HEIGHT = 800, 600
 _FOCAL_35MM = 40.3  # millimetres; EXIF holds whole ones
 _RADIAL = -0.06
+_MAX_STEP = np.radians(20.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +53,12 @@ def true_camera() -> "pycolmap.Camera":
 
 
 def camera_ring(num_images: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Cameras by hand around the scene: cam_from_world rotations (n, 3, 3) and centres (n, 3)."""
-    angle = 2 * np.pi * (np.arange(num_images) + rng.uniform(-0.15, 0.15, num_images)) / num_images
+    """Cameras by hand around the scene: cam_from_world rotations (n, 3, 3) and centres (n, 3).
+
+    Few images stand on part of the ring, so that neighbours can be matched.
+    """
+    step = min(2 * np.pi / num_images, _MAX_STEP)
+    angle = step * (np.arange(num_images) + rng.uniform(-0.15, 0.15, num_images))
     radius = RING_RADIUS * rng.uniform(0.94, 1.06, num_images)
     height = rng.uniform(1.2, 2.2, num_images)
     centers = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
