@@ -135,6 +135,8 @@ class _ShapeFit:
         step = self._constrained_step(H, self._factor(H), gradient)
         moved = self._residual(step)
         turned = (r + moved - 0.5 * (v * self._dot(r, moved) + r * self._dot(v, moved)) / s) / s
+        # Rounding along gamma, divided by s, would spoil the bound.
+        turned = np.einsum("kab,kb->ka", self._across, turned)
         slope, start = float(np.vdot(step, gradient)), self._smooth_cost(p, smoothing)
         length = 1.0
         while length > MIN_STEP and self._smooth_cost(p + length * step, smoothing) > start + 1e-4 * length * slope:
