@@ -59,6 +59,7 @@ def test_backward_edges_have_no_length():
     problem.directions[3] *= -1.0
     result = solve_bata(*problem.measured)
     assert np.isinf(result.lambdas[3])
+    assert result.cost == pytest.approx(ROBUST_SCALE**2 * np.log1p(ROBUST_SCALE**-2), rel=1e-3), "as if at 90 degrees"
     assert np.isfinite(np.delete(result.lambdas, 3)).all()
     assert align_positions(result.projection_centers, problem.centers)[0].max() < 1e-4
 
