@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.edge_weights import edge_weights
+from colmap_vg.epipolar.adjustment import adjust_epipolar
+from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.joint.alternation import solve_joint
@@ -34,6 +36,8 @@ from colmap_vg.view_graph import ViewGraph
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+ROUGH_ITERATIONS = 20
+"""Outer iterations of Alg. 2 before the epipolar adjustment, at most."""
 TRIAL_SHARE = 0.25
 """Share of the rotation gate that pairs on trial must keep within: one false pair in 10^5 does, by chance."""
 
@@ -140,6 +144,11 @@ def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOp
     """Positions, or positions and rotations, by the method chosen."""
     graph, method, n = ledger.graph, options.method, part.num_images
     if method == "epipolar":
+        problem = epipolar_problem(graph, part, options)
+        if problem is not None:
+            # The adjustment goes on from wherever Alg. 2 is: its last digits would be lost work.
+            rough = replace(options, method="2O", max_num_iterations=ROUGH_ITERATIONS, convergence_tolerance=1e-3)
+            return _adjust_epipolar(ledger, part, problem, _solve_poses(ledger, part, poses, rough))
         method = "2O"
     directions = _world_directions(graph, part, poses.rotations)
     weights = edge_weights(graph, part.edge_rows, options)
@@ -185,6 +194,15 @@ def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOp
         centers=joint.projection_centers,
         converged=joint.converged,
     )
+
+
+def _adjust_epipolar(ledger: Ledger, part: Subgraph, problem: EpipolarProblem, poses: _Poses) -> _Poses:
+    """Poses and free focal lengths at the minimum of the epipolar errors; reversed edges leave."""
+    directions = ledger.graph.cam2_in_cam1_directions[part.edge_rows]
+    found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
+    ledger.log.extend(found.log)
+    ledger.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
+    return _Poses(found.cam_from_world_rotations, found.projection_centers, found.focal_scales, found.converged)
 
 
 def _world_directions(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:

@@ -9,20 +9,20 @@ each edge's normal equations by its five or seven parameters are carried to its 
 The robust scale shrinks in steps. A step is taken only where it lowers the true cost.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.sampson import Matches, cauchy_costs, frames, normal_equations
+from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.sampson import cauchy_costs, frames, normal_equations
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
 from colmap_vg.linear.solvers import SingularMatrixError, factorize
 from colmap_vg.solution import LogEntry
-from colmap_vg.two_view.segments import segment_of_rows
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -59,58 +59,6 @@ class AdjustmentResult:
     cost: float
     converged: bool
     log: tuple[LogEntry, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class EpipolarProblem:
-    """Edges and matches of a part of a graph, and what of its cameras is free.
-
-    Attributes
-    ----------
-    num_images : int
-    edges : (m, 2) int64 array
-    offsets : (m + 1,) int64 array
-    bearings1, bearings2 : (k, 3) array
-        Unit rays taken with `focal_lengths`.
-    camera_idx : (n,) int64 array
-    focal_lengths : (c,) array
-        Pixels.
-    free_focals : (c,) bool array
-    """
-
-    num_images: int
-    edges: IntArray
-    offsets: IntArray
-    bearings1: Array
-    bearings2: Array
-    camera_idx: IntArray
-    focal_lengths: Array
-    free_focals: BoolArray
-
-    def matches(self, log_scales: Array) -> Matches:
-        """Bearings and pixel variances at logarithms (c,) of factors on the focal lengths."""
-        camera = self.camera_idx[self.edges]
-        focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
-        rays = [self.bearings1, self.bearings2]
-        if self.free_focals.any():
-            edge = segment_of_rows(self.offsets)
-            rays = [
-                normalized(x * np.stack([shrink, shrink, np.ones(len(x))], axis=1))
-                for x, shrink in zip(rays, np.exp(-log_scales[camera]).T[:, edge], strict=True)
-            ]
-        return Matches(self.offsets, rays[0], rays[1], focal[:, 0] ** -2.0, focal[:, 1] ** -2.0)
-
-    def without(self, dropped: BoolArray) -> "EpipolarProblem":
-        """The same without some edges."""
-        matches = Matches(self.offsets, self.bearings1, self.bearings2, *np.zeros((2, len(self.edges))))
-        kept = matches.of(np.flatnonzero(~dropped))
-        return replace(
-            self,
-            edges=self.edges[~dropped],
-            offsets=kept.offsets,
-            bearings1=kept.bearings1,
-            bearings2=kept.bearings2,
-        )
 
 
 @dataclass(frozen=True, eq=False)

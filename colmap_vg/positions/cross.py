@@ -36,7 +36,7 @@ def solve_cross(
     directions_world: Array,
     weights: Array | None = None,
     *,
-    max_num_iterations: int = 200,
+    max_num_iterations: int = 100,
     tolerance: float = 1e-8,
 ) -> PositionResult:
     """Positions whose differences are as parallel to the directions as possible.
@@ -60,7 +60,7 @@ def solve_cross(
     -------
     PositionResult
         ``sum ||p||^2 = 1``; the sign is that by which most of the weight of edges points forward. `lambdas` are the
-        lengths ``||p_j - p_i||``.
+        lengths ``||p_j - p_i||``. Where the reweighting does not converge, the positions of least cost on its way.
 
     Raises
     ------
@@ -83,18 +83,26 @@ def solve_cross(
         length = np.linalg.norm(p[j] - p[i], axis=1)
         return least_squares(1.0 / np.maximum(length, MIN_RELATIVE_LENGTH * np.median(length)) ** 2)
 
+    start = least_squares(np.ones(len(edges)))
+    best = [(sine_cost(start, edges, gamma, w), start)]
+
     def note(iteration: int, p: Array, change: float) -> None:
         log.append(LogEntry("cross", iteration, sine_cost(p, edges, gamma, w), change))
+        if log[-1].cost < best[0][0]:
+            best[0] = (log[-1].cost, p)
 
     p, count, converged = fixed_point(
         reweight,
-        least_squares(np.ones(len(edges))),
+        start,
         accelerate=False,
         max_num_iterations=max_num_iterations,
         tolerance=tolerance,
         on_iteration=note,
     )
-    return PositionResult(p, np.linalg.norm(p[j] - p[i], axis=1), log[-1].cost, count, converged, tuple(log))
+    cost = log[-1].cost
+    if not converged:
+        cost, p = best[0]
+    return PositionResult(p, np.linalg.norm(p[j] - p[i], axis=1), cost, count, converged, tuple(log))
 
 
 def sine_cost(p: Array, edges: IntArray, directions: Array, w: Array) -> float:

@@ -33,6 +33,9 @@ NEWTON_BELOW = 1e-2
 """Size of the gradient from which on the exact Hessian is tried."""
 COST_ROUNDING = 1e-13
 """Differences of costs below this share of all weights are rounding; then the gradient decides."""
+STALL_STEPS, STALL_SHARE = 10, 1e-8
+"""The cost counts as minimal when so many steps lower it by no more than this share. Outliers can draw two cameras
+into one, where the cost has a lower end that it never reaches and a gradient that does not vanish."""
 START_ITERATIONS, START_TOLERANCE = 100, 1e-3
 """Of Alg. 1C, which takes CLS's reversed and shrunken edges near their minimum."""
 
@@ -138,7 +141,7 @@ def minimize_directions(
     size = spread(p)
     cost, damping = problem.cost(p), 1e-3
     at = problem.linearize(p)
-    log = [LogEntry("cle1", 0, cost, at.size)]
+    log, stalled = [LogEntry("cle1", 0, cost, at.size)], False
     while at.size > tolerance and len(log) <= max_num_iterations:
         accepted = False
         newton = at.size < NEWTON_BELOW
@@ -157,8 +160,11 @@ def minimize_directions(
         damping = max(damping / 10.0, MIN_DAMPING)
         p, cost, at = new, new_cost, new_at
         log.append(LogEntry("cle1", len(log), cost, at.size))
+        stalled = len(log) > STALL_STEPS and log[-1 - STALL_STEPS].cost - cost <= STALL_SHARE * cost
+        if stalled:
+            break
     lengths = np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1)
-    return PositionResult(p, lengths, cost, len(log) - 1, at.size <= 1e2 * tolerance, tuple(log))
+    return PositionResult(p, lengths, cost, len(log) - 1, stalled or at.size <= 1e2 * tolerance, tuple(log))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,13 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 DAMPING = 1e-12
-"""Share of the mean diagonal added to each Hessian: it fixes translations, and the scale where nothing pulls."""
+"""Share of each camera's stiffness added to it: it fixes translations, and the scale where nothing pulls."""
 SMOOTHING_SHARE = 0.1
-"""Smoothing for the next step: this share of the gap, spread over the edges."""
+"""Smoothing for the next step: this share of the gap, spread over the edges that can feel it."""
 MAX_SHRINK = 0.1
 """The smoothing falls by no more than this factor in a step."""
+PATIENCE = 10
+"""Steps without a smaller gap after which to stop."""
 MIN_STEP = 2.0**-10
 REFINEMENTS = 2
 """Turns of each linear solve."""
@@ -72,17 +74,22 @@ def solve_shapefit(
     p = problem.least_squares()
     v, smoothing = np.zeros_like(directions_world), problem.mean_residual(p)
     log: list[LogEntry] = []
-    converged = False
+    best, best_cost, best_gap, best_iteration = p, np.inf, np.inf, 0
     for iteration in range(max_num_iterations):
-        cost, gap = problem.cost(p), problem.gap(p, v)
+        cost, gap = problem.cost(p), 0.0 if problem.vanishes(p) else problem.gap(p, v)
         log.append(LogEntry("shapefit", iteration, cost, gap / max(cost, np.finfo(float).tiny)))
-        converged = gap <= tolerance * cost or problem.vanishes(p)
-        if converged:
+        if cost < best_cost:
+            best, best_cost = p, cost
+        if gap < best_gap:
+            best_gap, best_iteration = gap, iteration
+        # A gap that no longer closes has come down to rounding.
+        if best_gap <= tolerance * best_cost or iteration >= best_iteration + PATIENCE:
             break
-        wanted = SMOOTHING_SHARE * gap / problem.total_weight
+        wanted = SMOOTHING_SHARE * gap / problem.weight_of_kinks
         smoothing = float(np.clip(wanted, MAX_SHRINK * smoothing, smoothing))
         p, v = problem.improve(p, v, smoothing)
-    return PositionResult(p, problem.along(p), problem.cost(p), len(log), converged, tuple(log))
+    converged = best_gap <= tolerance * best_cost
+    return PositionResult(best, problem.along(best), best_cost, len(log), converged, tuple(log))
 
 
 class _ShapeFit:
@@ -95,7 +102,8 @@ class _ShapeFit:
         self._pattern = BlockPattern(num_images, edges, 3)
         self._constraint = self._at_nodes(directions)
         self._least_squares_factor = self._factor(w[:, None, None] * self._across)
-        self.total_weight = float(w.sum())
+        # No more edges than there are unknowns lie exactly along their directions; only these feel the smoothing.
+        self.weight_of_kinks = float(w.mean()) * min(len(w), 3 * num_images)
 
     def least_squares(self) -> Array:
         """The minimum of the squared residuals within the constraints."""
@@ -157,13 +165,14 @@ class _ShapeFit:
         return sum_at_nodes(self._n, self._j, flow) - sum_at_nodes(self._n, self._i, flow)
 
     def _factor(self, H: Array) -> Factor:
-        damping = DAMPING * 2.0 * float(np.trace(H, axis1=1, axis2=2).sum()) / (3 * self._n)
+        trace = np.trace(H, axis1=1, axis2=2) / 3.0
+        stiffness = np.bincount(self._i, trace, self._n) + np.bincount(self._j, trace, self._n)
+        level = DAMPING * stiffness[:, None, None] * np.eye(3)
         while True:
-            level = damping * np.tile(np.eye(3), (self._n, 1, 1))
             try:
                 return factorize(self._pattern.assemble(H, H, -H, level), in_loop=True)
             except SingularMatrixError:  # weights that differ by many orders: rounding eats the damping
-                damping *= 100.0
+                level = 10.0 * level
 
     @staticmethod
     def _solve(factor: Factor, b: Array) -> Array:

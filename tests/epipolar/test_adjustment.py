@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from colmap_vg.epipolar.adjustment import Cameras, EpipolarProblem, adjust_epipolar, cost_and_gradient, gauged
+from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient, gauged
+from colmap_vg.epipolar.problem import EpipolarProblem
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized

@@ -1,0 +1,110 @@
+"""What an epipolar adjustment works on: the matches of part of a graph, and which focal lengths are free."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.epipolar.sampson import Matches
+from colmap_vg.geometry.directions import normalized
+from colmap_vg.graph.subgraph import Subgraph
+from colmap_vg.options import SolveOptions
+from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows
+from colmap_vg.view_graph import ViewGraph
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class EpipolarProblem:
+    """Edges and matches of a part of a graph, and what of its cameras is free.
+
+    Attributes
+    ----------
+    num_images : int
+    edges : (m, 2) int64 array
+    offsets : (m + 1,) int64 array
+    bearings1, bearings2 : (k, 3) array
+        Unit rays taken with `focal_lengths`.
+    camera_idx : (n,) int64 array
+    focal_lengths : (c,) array
+        Pixels.
+    free_focals : (c,) bool array
+    """
+
+    num_images: int
+    edges: IntArray
+    offsets: IntArray
+    bearings1: Array
+    bearings2: Array
+    camera_idx: IntArray
+    focal_lengths: Array
+    free_focals: BoolArray
+
+    def matches(self, log_scales: Array) -> Matches:
+        """Bearings and pixel variances at logarithms (c,) of factors on the focal lengths."""
+        camera = self.camera_idx[self.edges]
+        focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
+        rays = [self.bearings1, self.bearings2]
+        if self.free_focals.any():
+            edge = segment_of_rows(self.offsets)
+            rays = [
+                normalized(x * np.stack([shrink, shrink, np.ones(len(x))], axis=1))
+                for x, shrink in zip(rays, np.exp(-log_scales[camera]).T[:, edge], strict=True)
+            ]
+        return Matches(self.offsets, rays[0], rays[1], focal[:, 0] ** -2.0, focal[:, 1] ** -2.0)
+
+    def without(self, dropped: BoolArray) -> "EpipolarProblem":
+        """The same without some edges."""
+        matches = Matches(self.offsets, self.bearings1, self.bearings2, *np.zeros((2, len(self.edges))))
+        kept = matches.of(np.flatnonzero(~dropped))
+        return replace(
+            self,
+            edges=self.edges[~dropped],
+            offsets=kept.offsets,
+            bearings1=kept.bearings1,
+            bearings2=kept.bearings2,
+        )
+
+
+def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) -> EpipolarProblem | None:
+    """The matches of a part of a graph; None where the graph holds no matches, or no cameras that say what a pixel is.
+
+    Parameters
+    ----------
+    graph : ViewGraph
+    part : Subgraph
+    options : SolveOptions
+        `refine_focal_lengths`.
+
+    Returns
+    -------
+    EpipolarProblem or None
+    """
+    offsets, rays1, rays2 = graph.inlier_offsets, graph.inlier_bearings1, graph.inlier_bearings2
+    focals, camera_idx = graph.camera_focal_lengths, graph.camera_idx
+    if offsets is None or rays1 is None or rays2 is None or focals is None or camera_idx is None:
+        return None
+    rows, part_offsets = rows_of_segments(offsets, part.edge_rows)
+    if len(rows) == 0:
+        return None
+    refined = {
+        "always": np.ones(len(focals), dtype=np.bool_),
+        "never": np.zeros(len(focals), dtype=np.bool_),
+        "auto": np.zeros(len(focals), dtype=np.bool_)
+        if graph.camera_focal_known is None
+        else ~graph.camera_focal_known,
+    }[options.refine_focal_lengths]
+    seen = np.isin(np.arange(len(focals)), camera_idx[part.images])
+    return EpipolarProblem(
+        part.num_images,
+        part.edges,
+        part_offsets,
+        rays1[rows],
+        rays2[rows],
+        camera_idx[part.images],
+        focals,
+        np.asarray(refined & seen),
+    )
