@@ -7,7 +7,9 @@ its minimum. Here Levenberg-Marquardt steps with sparse factors go down the cost
 * chordal, ``||gamma - d̂||² = 2 - 2 c``: gradient ``-2 q / l``, Gauss-Newton Hessian ``2 (I - d̂ d̂ᵀ) / l²``;
 * orthogonal, ``||gamma x d̂||² = 1 - c²``: gradient ``-2 c q / l``, Hessian ``2 (I - d̂ d̂ᵀ - q qᵀ) / l²``.
 
-Neither sees a translation or a scale: the centroid goes to 0, the spread back to that of the start.
+Neither sees a translation or a scale: the centroid goes to 0, the spread back to that of the start. The lowest cost is
+not always the best answer: where short, noisy pairs mix with long ones, drawing whole groups of cameras together can
+cost less than the truth (seen on 606 simulated cameras, 20 degrees on the shortest pairs). Alg. 1 stays nearer to CLS.
 """
 
 from dataclasses import dataclass
@@ -27,8 +29,8 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Metric = Literal["chordal", "orthogonal"]
 
-MIN_DAMPING, MAX_DAMPING = 1e-10, 1e8
-"""Shares of each camera's mean curvature."""
+MIN_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-10, 1.0, 1e8
+"""Shares of each camera's mean curvature. The first is large, to keep to the start's valley."""
 NEWTON_BELOW = 1e-2
 """Size of the gradient from which on the exact Hessian is tried."""
 COST_ROUNDING = 1e-13
@@ -139,7 +141,7 @@ def minimize_directions(
     problem = _Directions(num_images, edges, directions_world, unit_weights(weights, len(edges)), metric)
     p = centered(initial_centers)
     size = spread(p)
-    cost, damping = problem.cost(p), 1e-3
+    cost, damping = problem.cost(p), FIRST_DAMPING
     at = problem.linearize(p)
     log, stalled = [LogEntry("cle1", 0, cost, at.size)], False
     while at.size > tolerance and len(log) <= max_num_iterations:
