@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+EFFICIENT_CAUCHY = 2.385
+"""Cauchy scale over sigma at which normal noise loses 5 % of efficiency (Holland & Welsch 1977)."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+
 
 def geman_mcclure_weight(s: Array) -> Array:
     """``rho(s) = s / (1 + s)``, weight ``1 / (1 + s)^2``."""

@@ -21,15 +21,12 @@ from colmap_vg.epipolar.sampson import (
 )
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
+from colmap_vg.robust import EFFICIENT_CAUCHY, MAD_TO_SIGMA
 from colmap_vg.two_view.segments import segment_of_rows
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_EFFICIENT_CAUCHY = (
-    2.385  # Cauchy scale over sigma at which normal noise loses 5 % of efficiency (Holland & Welsch 1977)
-)
-_MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 _MIN_SIGMA_PX = 0.02  # pixels; keypoints are not better than this, and exact data keep finite information
 
 
@@ -103,7 +100,7 @@ def refine_relative_poses(
     for _ in range(num_rounds):
         sigma = _robust_sigmas(matches.of(filled), R[filled], d[filled])
         R[filled], d[filled] = _levenberg(
-            matches.of(filled), R[filled], d[filled], _EFFICIENT_CAUCHY * sigma, -(-num_iterations // num_rounds)
+            matches.of(filled), R[filled], d[filled], EFFICIENT_CAUCHY * sigma, -(-num_iterations // num_rounds)
         )
     m = len(R)
     information, median, sigma = np.zeros((m, 5, 5)), np.full(m, np.nan), np.full(m, np.nan)
@@ -143,7 +140,7 @@ def _levenberg(matches: Matches, R: Array, d: Array, scale: Array, num_iteration
 def _medians_and_sigmas(matches: Matches, R: Array, d: Array) -> tuple[Array, Array]:
     median = median_errors(matches, R, d)
     count = np.diff(matches.offsets)
-    return median, _MAD_TO_SIGMA * median * np.sqrt(count / np.maximum(count - 5, 1))
+    return median, MAD_TO_SIGMA * median * np.sqrt(count / np.maximum(count - 5, 1))
 
 
 def _robust_sigmas(matches: Matches, R: Array, d: Array) -> Array:
@@ -152,7 +149,7 @@ def _robust_sigmas(matches: Matches, R: Array, d: Array) -> Array:
 
 def _information(matches: Matches, R: Array, d: Array, sigma: Array) -> Array:
     """Inverse covariance in ``(w, tau)``: ``(J^T W J / mean w) (mean psi')^2 / mean psi^2``, (m, 5, 5)."""
-    scale = _EFFICIENT_CAUCHY * np.maximum(sigma, _MIN_SIGMA_PX)
+    scale = EFFICIENT_CAUCHY * np.maximum(sigma, _MIN_SIGMA_PX)
     hessian = normal_equations(matches, R, d, scale).hessians
     sums = np.empty((3, len(R)))
     for edges, _, offsets, r in residuals_by_block(matches, R, d):

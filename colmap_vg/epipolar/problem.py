@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.epipolar.sampson import Matches
+from colmap_vg.epipolar.tracks import Tracks, spread_tracks
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.options import SolveOptions
@@ -67,6 +68,28 @@ class EpipolarProblem:
             bearings1=kept.bearings1,
             bearings2=kept.bearings2,
         )
+
+
+def tracks_of_part(graph: ViewGraph, part: Subgraph) -> Tracks | None:
+    """A spread of the tracks that a part's matches make; None where the graph does not know the keypoints.
+
+    Parameters
+    ----------
+    graph : ViewGraph
+    part : Subgraph
+
+    Returns
+    -------
+    Tracks or None
+    """
+    offsets, rays1, rays2 = graph.inlier_offsets, graph.inlier_bearings1, graph.inlier_bearings2
+    keypoints1, keypoints2 = graph.inlier_keypoints1, graph.inlier_keypoints2
+    if offsets is None or rays1 is None or rays2 is None or keypoints1 is None or keypoints2 is None:
+        return None
+    rows, of_part = rows_of_segments(offsets, part.edge_rows)
+    return spread_tracks(
+        part.num_images, part.edges, of_part, keypoints1[rows], keypoints2[rows], rays1[rows], rays2[rows]
+    )
 
 
 def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) -> EpipolarProblem | None:

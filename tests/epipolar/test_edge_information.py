@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from matched_rays import matched_rays
 from scipy.optimize import least_squares
 
-from colmap_vg.epipolar import edge_information, sampson
+from colmap_vg.epipolar import sampson
 from colmap_vg.epipolar.edge_information import refine_relative_poses
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
+from colmap_vg.robust import EFFICIENT_CAUCHY
 from colmap_vg.two_view.essential import essential_from_pose, sampson_errors
 
 
@@ -44,7 +45,7 @@ def test_minimum_is_the_one_that_scipy_finds():
     data = matched_rays(1, [80], sigma=6e-4, outlier_share=0.1)
     f1, f2 = np.array([900.0]), np.array([500.0])
     found = _refine(data, data.rotations, data.directions, f1, f2, num_iterations=200)
-    scale = edge_information._EFFICIENT_CAUCHY * found.sigmas_px[0]
+    scale = EFFICIENT_CAUCHY * found.sigmas_px[0]
 
     def residuals(x):
         R = so3.exp(x[None, :3]) @ data.rotations
