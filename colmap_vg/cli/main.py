@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
@@ -13,11 +13,12 @@ from colmap_vg.cli import colmap_flags
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.errors import ColmapVgError, OptionError
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.options import Method as SolverMethod
 
 INTERRUPTED = 130
 """Exit code of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
 
-METHODS = "epipolar|1C|1O|2C|2O|cls|cross|orthogonal|lud|shapefit|bata"
+METHODS = "|".join(get_args(SolverMethod))
 DEFAULTS = MappingOptions()
 
 app = typer.Typer(
