@@ -12,9 +12,17 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.database import check_database
 from colmap_vg.colmap_io.read import read_with_caveats
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
+from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
 from colmap_vg.errors import MappingError
 from colmap_vg.ledger import described
-from colmap_vg.mapping.build import BuildResult, build_model, extract_colors
+from colmap_vg.mapping.build import (
+    MAX_NUM_ROUNDS,
+    SETTLED_COST,
+    BuildResult,
+    adjust_once_more,
+    build_model,
+    extract_colors,
+)
 from colmap_vg.options import MappingOptions
 from colmap_vg.output_folder import publish_models, refuse_models, work_folder
 from colmap_vg.solution import PoseSolution
@@ -22,6 +30,10 @@ from colmap_vg.solve import solve_view_graph
 from colmap_vg.stages import StageEvent, StageLog
 from colmap_vg.verdicts import ImageVerdict, SolutionStatus
 from colmap_vg.view_graph import ViewGraph
+
+SAME_LENS_COST = 0.8
+"""Share of its cost that bundle adjustment must leave when cameras that shared a calibration get their own: 0.98 to
+0.99 was left where there was one lens and images were strong, 0.89 where they were weak."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +123,21 @@ def map_database(
         solution = _solve(graph, options, log)
         if not solution.registered.any():
             raise MappingError(f"{database_path}: {solution.message}")
-        with log.stage("load"), loaded_cache(database_path, work, options.read.min_num_inliers) as cache:
-            reconstruction = reconstruction_from_solution(cache, solution, graph)
+        shared = shared_cameras(graph) if options.share_cameras else []
+        with log.stage("load"):
+            with loaded_cache(database_path, work, options.read.min_num_inliers, shared) as (cache, replaced):
+                reconstruction = reconstruction_from_solution(cache, solution, graph)
+            if replaced:
+                log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
         result = build_model(cache, reconstruction, options, log)
         if reconstruction.num_reg_images() < 2 or reconstruction.num_points3D() == 0:
             raise MappingError(
                 f"{database_path}: {int(solution.registered.sum())} poses were solved, but no three images share points"
                 " at an angle that could fix them; add overlapping photographs, taken from different places"
             )
+        if replaced:
+            with log.stage("cameras"), loaded_cache(database_path, work, options.read.min_num_inliers) as (cache, _):
+                reconstruction = _on_own_cameras(cache, reconstruction, replaced, options, log)
         with log.stage("write"):
             reconstruction.normalize()
             if options.extract_colors:
@@ -149,6 +168,26 @@ def _solve(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolu
         solution = solve_view_graph(graph, solve)
         log.result(solution.message)
     return solution
+
+
+def _on_own_cameras(
+    cache: "pycolmap.DatabaseCache",
+    shared: "pycolmap.Reconstruction",
+    replaced: dict[int, int],
+    options: MappingOptions,
+    log: StageLog,
+) -> "pycolmap.Reconstruction":
+    """The model on the database's own cameras, with the shared calibrations unless these cost too much."""
+    trial = with_own_cameras(cache, shared, replaced)
+    left = adjust_once_more(cache, trial, options)
+    if left < SAME_LENS_COST:
+        for _ in range(MAX_NUM_ROUNDS):
+            if adjust_once_more(cache, trial, options) > SETTLED_COST:
+                break
+        log.result(f"the photographs show different lenses: calibrated one by one, the cost falls by {1.0 - left:.0%}")
+        return trial
+    log.result(f"one lens: calibrated one by one, the cost would fall by {1.0 - left:.1%} only")
+    return with_own_cameras(cache, shared, replaced)
 
 
 def _as_in_model(

@@ -85,7 +85,7 @@ def solve(
     with log.stage("write"), work_folder(output_path, overwrite) as work:
         staged = work / "0"
         staged.mkdir(exist_ok=True)
-        with loaded_cache(database_path, work, read.min_num_inliers) as cache:
+        with loaded_cache(database_path, work, read.min_num_inliers) as (cache, _):
             reconstruction_from_solution(cache, solution, graph).write(staged)
         publish_models([staged], output_path)
         log.result(str(output_path / "0"))

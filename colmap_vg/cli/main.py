@@ -77,6 +77,10 @@ RefineIntrinsics = Annotated[
     str, typer.Option(*colmap_flags.REFINE_INTRINSICS, metavar="0|1", help="GLOMAP's: focal length and distortion.")
 ]
 ExtractColors = Annotated[str, typer.Option(*colmap_flags.EXTRACT_COLORS, metavar="0|1")]
+ShareCameras = Annotated[
+    str,
+    typer.Option("--share_cameras", metavar="0|1", help="One lens for photographs without EXIF that show no other."),
+]
 NumThreads = Annotated[int, typer.Option(*colmap_flags.NUM_THREADS, help="-1: all cores.")]
 RandomSeed = Annotated[int, typer.Option(*colmap_flags.RANDOM_SEED, help="Same seed and threads, same result.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the models that the output folder holds.")]
@@ -117,6 +121,7 @@ def run(
     ba_refine_focal_length: RefineFocalLength = "1",
     ba_refine_principal_point: RefinePrincipalPoint = "0",
     ba_refine_extra_params: RefineExtraParams = "1",
+    share_cameras: ShareCameras = "1",
     extract_colors: ExtractColors = "1",
     num_threads: NumThreads = -1,
     random_seed: RandomSeed = 0,
@@ -153,6 +158,7 @@ def run(
             ba_refine_focal_length,
             ba_refine_principal_point,
             ba_refine_extra_params,
+            share_cameras,
             extract_colors,
             overwrite,
             num_threads,
@@ -180,6 +186,7 @@ def mapper(
     ba_refine_principal_point: RefinePrincipalPoint = "0",
     ba_refine_extra_params: RefineExtraParams = "1",
     optimize_intrinsics: RefineIntrinsics = "",
+    share_cameras: ShareCameras = "1",
     extract_colors: ExtractColors = "1",
     num_threads: NumThreads = -1,
     random_seed: RandomSeed = 0,
@@ -213,6 +220,7 @@ def mapper(
             ba_refine_focal_length,
             ba_refine_principal_point,
             ba_refine_extra_params,
+            share_cameras,
             extract_colors,
             overwrite,
             num_threads,
@@ -363,6 +371,7 @@ def _mapping_options(
     ba_refine_focal_length: str,
     ba_refine_principal_point: str,
     ba_refine_extra_params: str,
+    share_cameras: str,
     extract_colors: str,
     overwrite: bool,
     num_threads: int,
@@ -374,6 +383,7 @@ def _mapping_options(
         ba_refine_focal_length=_boolean("--ba_refine_focal_length", ba_refine_focal_length),
         ba_refine_principal_point=_boolean("--ba_refine_principal_point", ba_refine_principal_point),
         ba_refine_extra_params=_boolean("--ba_refine_extra_params", ba_refine_extra_params),
+        share_cameras=_boolean("--share_cameras", share_cameras),
         extract_colors=_boolean("--extract_colors", extract_colors),
         overwrite=overwrite,
         num_threads=num_threads,

@@ -21,6 +21,8 @@ BoolArray = NDArray[np.bool_]
 
 CALIBRATED, UNCALIBRATED = 2, 3
 """COLMAP's two-view configurations of general scenes."""
+ALIKE = 0.03
+"""Relative difference below which two votes are taken for one lens; lenses differ by more, or it does not matter."""
 MAX_MATCHES_PER_VOTE = 300
 """Matches of a pair that its vote uses, evenly over its list; more change the vote by less than its own error."""
 
@@ -60,12 +62,10 @@ def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> Fo
     if calibration is None:
         caveat = "No pair has enough matches to check the focal lengths; they are taken as they are in the database."
         return FocalDecision(np.ones(len(focals)), prior, (caveat,))
-    scales, size = calibration.focal_lengths / focals, np.array([max(c.width, c.height) for c in tables.cameras])
-    # Cameras that cannot vote for themselves take the ratio of focal length to size that the folder's others have.
+    found = calibration.focal_lengths
     without = ~given & ~calibration.decided
-    if calibration.decided.any():
-        common = float(np.median((scales * focals / size)[calibration.decided]))
-        scales = np.where(without, common * size / focals, scales)
+    found = np.where(given, found, _in_common(tables, found, calibration, given))
+    scales = found / focals
     caveats = [
         f"Camera {c.camera_id}: the focal length {f:.1f} px of the database is contradicted by its image pairs;"
         f" {s * f:.1f} px is used instead."
@@ -79,6 +79,38 @@ def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> Fo
             f" {source}."
         )
     return FocalDecision(np.asarray(scales, dtype=float), given & ~calibration.found, tuple(caveats))
+
+
+def _in_common(tables: DatabaseTables, found: Array, calibration: SelfCalibration, given: BoolArray) -> Array:
+    """Focal lengths, equal among alike cameras without a given one unless their own pairs contradict it.
+
+    Most such folders were taken with one lens. Cameras that could not vote take what the others of the folder have.
+    """
+    decided, sigmas = calibration.decided & ~given, calibration.by_pairs.estimates.sigmas
+    size = np.array([max(c.width, c.height) for c in tables.cameras], dtype=float)
+    anywhere = np.log(np.median((found / size)[calibration.decided])) if calibration.decided.any() else None
+    kinds: dict[object, list[int]] = {}
+    for row in np.flatnonzero(~given):
+        camera = tables.cameras[row]
+        kinds.setdefault((camera.model_name, camera.width, camera.height), []).append(int(row))
+    result = found.copy()
+    for members in kinds.values():
+        rows = np.array(members)
+        voters = rows[decided[rows]]
+        if len(voters) == 0:
+            if anywhere is not None:
+                result[rows] = np.exp(anywhere) * size[rows]
+            continue
+        log_ratio = np.log(found[voters] / size[voters])
+        common = float(np.median(log_ratio))
+        agree = np.abs(log_ratio - common) <= np.maximum(3.0 * np.nan_to_num(sigmas[voters], posinf=0.0), ALIKE)
+        if agree.mean() < 0.5:
+            continue
+        weights = 1.0 / np.square(np.clip(np.nan_to_num(sigmas[voters[agree]], posinf=1.0), 1e-3, 1.0))
+        common = float(np.average(log_ratio[agree], weights=weights))
+        joined = np.concatenate([voters[agree], rows[~decided[rows]]])
+        result[joined] = np.exp(common) * size[joined]
+    return result
 
 
 def _self_calibration(

@@ -1,6 +1,6 @@
 """From a pose solution to a `pycolmap.Reconstruction` with the database's cameras, rigs, frames, images and ids."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
@@ -10,6 +10,7 @@ import pycolmap
 
 from colmap_vg.colmap_io.cameras import with_focal_scale
 from colmap_vg.colmap_io.database import working_copy
+from colmap_vg.colmap_io.shared_cameras import merge_cameras
 from colmap_vg.errors import DatabaseError
 from colmap_vg.solution import PoseSolution
 from colmap_vg.view_graph import ViewGraph
@@ -17,9 +18,27 @@ from colmap_vg.view_graph import ViewGraph
 
 @contextmanager
 def loaded_cache(
-    database_path: str | PathLike[str], work_folder: Path, min_num_matches: int
-) -> Iterator["pycolmap.DatabaseCache"]:
+    database_path: str | PathLike[str],
+    work_folder: Path,
+    min_num_matches: int,
+    shared: Sequence[Sequence[int]] = (),
+) -> Iterator[tuple["pycolmap.DatabaseCache", dict[int, int]]]:
     """COLMAP's view of a database, read from a copy that is gone afterwards: opening a database changes the file.
+
+    Parameters
+    ----------
+    database_path : path
+    work_folder : Path
+        For the copy.
+    min_num_matches : int
+    shared : sequence of sequence of int
+        Cameras to be merged, see `merge_cameras`.
+
+    Yields
+    ------
+    cache : pycolmap.DatabaseCache
+    replaced : dict of int to int
+        For each camera that was merged into another one, that one.
 
     Raises
     ------
@@ -29,12 +48,16 @@ def loaded_cache(
     copy = working_copy(database_path, work_folder)
     try:
         try:
+            replaced: dict[int, int] = {}
+            if shared:
+                pycolmap.Database.open(copy).close()  # an old schema becomes the current one
+                replaced = merge_cameras(copy, shared)
             with pycolmap.Database.open(copy) as database:
                 options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches, load_all_images=True)
                 cache = pycolmap.DatabaseCache.create(database, options)
         except (ValueError, RuntimeError, IndexError) as error:
             raise DatabaseError(f"{database_path}: pycolmap cannot read the database ({error})") from error
-        yield cache
+        yield cache, replaced
     finally:
         for leftover in work_folder.glob(copy.name + "*"):
             leftover.unlink()

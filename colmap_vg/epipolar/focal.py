@@ -202,7 +202,7 @@ def _vote(
         step = np.where(np.isfinite(sigmas), best - log_focals, 0.0) * (0.6 if several else 1.0)
         if several:
             step = step + _common_shift(sides, log_focals + step)
-        log_focals = log_focals + step
+        log_focals = np.clip(log_focals + step, LOWEST, HIGHEST)
         if np.abs(step).max(initial=0.0) < 1e-4:
             break
     num_pairs = np.bincount(sides.camera, minlength=c).astype(np.int64)

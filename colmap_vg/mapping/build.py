@@ -102,6 +102,24 @@ def build_model(
     return BuildResult(frozenset(added), frozenset(removed))
 
 
+def adjust_once_more(
+    cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", options: MappingOptions
+) -> float:
+    """One more round of bundle adjustment on a finished model, in place.
+
+    Returns
+    -------
+    float
+        The share of its cost that the round left.
+    """
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(reconstruction)
+    share = _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-4)
+    mapper.end_reconstruction(False)
+    reconstruction.update_point_3d_errors()
+    return share
+
+
 def extract_colors(
     reconstruction: "pycolmap.Reconstruction", image_path: str | PathLike[str] | None, log: StageLog
 ) -> None:

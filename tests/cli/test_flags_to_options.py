@@ -87,6 +87,8 @@ def test_solver_flags(jobs: Jobs) -> None:
     )
     assert options.solve == expected
     assert not options.extract_colors
+    assert options.share_cameras
+    assert not mapping(jobs, "--share_cameras", "0").share_cameras
     assert options.overwrite
     assert mapping(jobs, "--GlobalMapper.ra_max_rotation_error_deg", "5").solve.rotation_gate_deg == 5.0
     assert mapping(jobs, "--trust_focal_lengths", "never").read.trust_focal_lengths == "never"

@@ -29,7 +29,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ViewGraph, P
 def test_the_poses_are_the_solutions(solved: tuple[Path, ViewGraph, PoseSolution], tmp_path: Path) -> None:
     path, graph, solution = solved
     before = sha256(path)
-    with loaded_cache(path, tmp_path, 15) as cache:
+    with loaded_cache(path, tmp_path, 15) as (cache, _):
         model = reconstruction_from_solution(cache, solution, graph)
     assert sha256(path) == before
     assert list(tmp_path.iterdir()) == []
@@ -48,7 +48,7 @@ def test_images_that_are_not_registered_have_no_pose(
 ) -> None:
     path, graph, solution = solved
     registered = np.array([True, False, True, True, False])
-    with loaded_cache(path, tmp_path, 15) as cache:
+    with loaded_cache(path, tmp_path, 15) as (cache, _):
         model = reconstruction_from_solution(cache, replace(solution, registered=registered), graph)
     assert sorted(model.reg_image_ids()) == [1003, 1009, 1012]
     assert model.num_images() == 5
@@ -62,7 +62,7 @@ def test_focal_factors_scale_the_cameras_and_one_changes_no_bit(
 ) -> None:
     path, graph, solution = solved
     scales = np.array([1.0, 1.1, 1.0, 1.0, 0.9])
-    with loaded_cache(path, tmp_path, 15) as cache:
+    with loaded_cache(path, tmp_path, 15) as (cache, _):
         model = reconstruction_from_solution(cache, replace(solution, focal_scales=scales), graph)
     for camera_id in (51, 53, 54):
         assert model.camera(camera_id).params.tolist() == list(RADIAL[1])
