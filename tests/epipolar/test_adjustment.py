@@ -245,6 +245,11 @@ def test_triplets_of_coinciding_cameras_keep_everything_finite():
     cost, gradient = cost_and_gradient(problem, Cameras(R, bent, np.zeros(1)), 2.0)
     assert np.isfinite(cost)
     assert np.isfinite(gradient).all()
+    # A direction over a distance of nothing would pull a million times harder than those of cameras apart.
+    apart = bent.copy()
+    apart[1, 0] += 0.2
+    usual = cost_and_gradient(problem, Cameras(R, apart, np.zeros(1)), 2.0)[1]
+    assert np.abs(gradient).max() < 100.0 * np.abs(usual).max()
     assert np.isfinite(adjust_epipolar(problem, R, bent, directions).projection_centers).all()
 
 
