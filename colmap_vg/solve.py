@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.edge_weights import edge_weights
 from colmap_vg.epipolar.adjustment import adjust_epipolar
-from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem
+from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.joint.alternation import solve_joint
@@ -202,7 +202,8 @@ def _adjust_epipolar(ledger: Ledger, part: Subgraph, problem: EpipolarProblem, p
     found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     ledger.log.extend(found.log)
     ledger.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
-    return _Poses(found.cam_from_world_rotations, found.projection_centers, found.focal_scales, found.converged)
+    focal_scales = found.focal_scales[focal_groups(ledger.graph)[0]]
+    return _Poses(found.cam_from_world_rotations, found.projection_centers, focal_scales, found.converged)
 
 
 def _world_directions(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:

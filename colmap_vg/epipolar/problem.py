@@ -31,6 +31,7 @@ class EpipolarProblem:
     bearings1, bearings2 : (k, 3) array
         Unit rays taken with `focal_lengths`.
     camera_idx : (n,) int64 array
+        Of each image, among those below; see `focal_groups`.
     focal_lengths : (c,) array
         Pixels.
     free_focals : (c,) bool array
@@ -108,6 +109,7 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
     rows, part_offsets = rows_of_segments(offsets, part.edge_rows)
     if len(rows) == 0:
         return None
+    group, of_group = focal_groups(graph)
     refined = {
         "always": np.ones(len(focals), dtype=np.bool_),
         "never": np.zeros(len(focals), dtype=np.bool_),
@@ -115,7 +117,6 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
         if graph.camera_focal_known is None
         else ~graph.camera_focal_known,
     }[options.refine_focal_lengths]
-    seen = np.isin(np.arange(len(focals)), camera_idx[part.images])
     triplets: Triplets | None = None
     if graph.inlier_keypoints1 is not None and graph.inlier_keypoints2 is not None:
         triplets = find_triplets(
@@ -127,14 +128,45 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
             rays2[rows],
             graph.cam2_from_cam1_rotations[part.edge_rows],
         )
+    camera_idx = group[camera_idx[part.images]]
+    seen = np.isin(np.arange(len(of_group)), camera_idx)
+    focals, free = focals[of_group], refined[of_group] & seen
     return EpipolarProblem(
         part.num_images,
         part.edges,
         part_offsets,
         rays1[rows],
         rays2[rows],
-        camera_idx[part.images],
+        camera_idx,
         focals,
-        np.asarray(refined & seen),
+        np.asarray(free),
         triplets if triplets is not None and len(triplets.images) else None,
     )
+
+
+def focal_groups(graph: ViewGraph) -> tuple[IntArray, IntArray]:
+    """Cameras that share their focal length in the adjustment: the same one, not known otherwise.
+
+    Photographs without EXIF get a camera each, and one focal length that all of them vote for. Few of them could tell
+    their own; bundle adjustment sets them free.
+
+    Parameters
+    ----------
+    graph : ViewGraph
+
+    Returns
+    -------
+    group : (c,) int64 array
+        Of each camera.
+    first : (g,) int64 array
+        A camera of each group.
+    """
+    if graph.camera_focal_lengths is None:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    count = len(graph.camera_focal_lengths)
+    known = np.zeros(count, dtype=bool) if graph.camera_focal_known is None else graph.camera_focal_known
+    # Cameras whose focal length is known stay by themselves.
+    own = np.where(known, np.arange(count), -1)
+    keys = np.stack([graph.camera_focal_lengths, own], axis=1)
+    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return group.reshape(-1).astype(np.int64), first.astype(np.int64)
