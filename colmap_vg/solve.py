@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.edge_weights import edge_weights
 from colmap_vg.epipolar.adjustment import adjust_epipolar
-from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups, tracks_of_part
+from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.joint.alternation import solve_joint
@@ -199,8 +199,7 @@ def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOp
 def _adjust_epipolar(ledger: Ledger, part: Subgraph, problem: EpipolarProblem, poses: _Poses) -> _Poses:
     """Poses and free focal lengths at the minimum of the epipolar errors; reversed edges leave."""
     directions = ledger.graph.cam2_in_cam1_directions[part.edge_rows]
-    tracks = tracks_of_part(ledger.graph, part)
-    found = adjust_epipolar(problem, poses.rotations, poses.centers, directions, tracks=tracks)
+    found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     ledger.log.extend(found.log)
     ledger.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
     focal_scales = found.focal_scales[focal_groups(ledger.graph)[0]]

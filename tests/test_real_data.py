@@ -44,7 +44,9 @@ def test_models_are_as_accurate_as_those_of_global_mapping(name: str, data_folde
     assert (folder / "database.db").read_bytes() == before
 
 
-@pytest.mark.parametrize(("name", "bound_mm"), [("fountain-p11", 10.0), ("herz-jesus-p25", 15.0), ("temple", 20.0)])
+@pytest.mark.parametrize(
+    ("name", "bound_mm"), [("fountain-p11", 2.7), ("herz-jesus-p25", 6.5), ("temple", 3.0), ("castle-p19", 100.0)]
+)
 def test_the_graph_alone_is_already_close(name: str, bound_mm: float, data_folder: Path) -> None:
     folder = data_folder / "images" / name
     graph = read_view_graph(folder / "database.db")

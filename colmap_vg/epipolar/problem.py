@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.epipolar.depth_agreement import TripletRays
 from colmap_vg.epipolar.sampson import Matches
-from colmap_vg.epipolar.tracks import Tracks, spread_tracks
+from colmap_vg.epipolar.triplets import Triplets, find_triplets
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.options import SolveOptions
@@ -34,6 +35,8 @@ class EpipolarProblem:
     focal_lengths : (c,) array
         Pixels.
     free_focals : (c,) bool array
+    triplets : Triplets or None
+        Tracks that three images share; they tell the ratios of baselines.
     """
 
     num_images: int
@@ -44,6 +47,7 @@ class EpipolarProblem:
     camera_idx: IntArray
     focal_lengths: Array
     free_focals: BoolArray
+    triplets: Triplets | None = None
 
     def matches(self, log_scales: Array) -> Matches:
         """Bearings and pixel variances at logarithms (c,) of factors on the focal lengths."""
@@ -62,35 +66,26 @@ class EpipolarProblem:
         """The same without some edges."""
         matches = Matches(self.offsets, self.bearings1, self.bearings2, *np.zeros((2, len(self.edges))))
         kept = matches.of(np.flatnonzero(~dropped))
+        triplets = None if self.triplets is None else self.triplets.without(dropped)
         return replace(
             self,
             edges=self.edges[~dropped],
             offsets=kept.offsets,
             bearings1=kept.bearings1,
             bearings2=kept.bearings2,
+            triplets=None if triplets is None or len(triplets.images) == 0 else triplets,
         )
 
-
-def tracks_of_part(graph: ViewGraph, part: Subgraph) -> Tracks | None:
-    """A spread of the tracks that a part's matches make; None where the graph does not know the keypoints.
-
-    Parameters
-    ----------
-    graph : ViewGraph
-    part : Subgraph
-
-    Returns
-    -------
-    Tracks or None
-    """
-    offsets, rays1, rays2 = graph.inlier_offsets, graph.inlier_bearings1, graph.inlier_bearings2
-    keypoints1, keypoints2 = graph.inlier_keypoints1, graph.inlier_keypoints2
-    if offsets is None or rays1 is None or rays2 is None or keypoints1 is None or keypoints2 is None:
-        return None
-    rows, of_part = rows_of_segments(offsets, part.edge_rows)
-    return spread_tracks(
-        part.num_images, part.edges, of_part, keypoints1[rows], keypoints2[rows], rays1[rows], rays2[rows]
-    )
+    def triplet_rays(self, triplets: Triplets, log_scales: Array) -> TripletRays:
+        """Rays and pixel variances of triplets at logarithms (c,) of factors on the focal lengths."""
+        camera = self.camera_idx[triplets.images].T
+        focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
+        rays = triplets.bearings
+        if self.free_focals.any():
+            shrink = np.exp(-log_scales[camera])[:, segment_of_rows(triplets.offsets)]
+            rays = rays * np.stack([shrink, shrink, np.ones(shrink.shape)], axis=1)
+            rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return TripletRays(triplets.offsets, rays, focal**-2.0)
 
 
 def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) -> EpipolarProblem | None:
@@ -122,6 +117,17 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
         if graph.camera_focal_known is None
         else ~graph.camera_focal_known,
     }[options.refine_focal_lengths]
+    triplets: Triplets | None = None
+    if graph.inlier_keypoints1 is not None and graph.inlier_keypoints2 is not None:
+        triplets = find_triplets(
+            part.edges,
+            part_offsets,
+            graph.inlier_keypoints1[rows],
+            graph.inlier_keypoints2[rows],
+            rays1[rows],
+            rays2[rows],
+            graph.cam2_from_cam1_rotations[part.edge_rows],
+        )
     camera_idx = group[camera_idx[part.images]]
     seen = np.isin(np.arange(len(of_group)), camera_idx)
     focals, free = focals[of_group], refined[of_group] & seen
@@ -134,6 +140,7 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
         camera_idx,
         focals,
         np.asarray(free),
+        triplets if triplets is not None and len(triplets.images) else None,
     )
 
 

@@ -158,7 +158,7 @@ class PoseGraphSolver:
         # The gauge leaves six directions free; extra stiffness at one camera fixes them and bends nothing else.
         level[0] += at.diagonal[0] + at.diagonal.mean(axis=0)
         try:
-            factor = factorize(self._pattern.assemble(ii, at.terms.jj, ij, level[:, :, None] * np.eye(6)))
+            factor = factorize(self._pattern.assemble(ii, at.terms.jj, ij, level[:, :, None] * np.eye(6)), in_loop=True)
         except SingularMatrixError:
             return None
         return -factor.solve(at.gradient.ravel()).reshape(-1, 6)

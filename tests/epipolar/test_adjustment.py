@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_of, linearized
+from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient, gauged
 from colmap_vg.epipolar.problem import EpipolarProblem
-from colmap_vg.epipolar.tracks import spread_tracks, triangulated
+from colmap_vg.epipolar.triplets import find_triplets
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
@@ -39,35 +39,26 @@ def scene(seed, *, num_images=8, num_matches=40, sigma_px=0.0, focal=1000.0, wro
         np.full(num_cameras, focal * wrong),
         np.full(num_cameras, free),
     )
-    p -= p.mean(axis=0)
-    return problem, R, p / np.sqrt(np.mean(np.sum(p**2, axis=1)))
-
-
-def cameras_at(R, p, log_scales=(0.0, 0.0), points=None):
-    return Cameras(R, p, np.array(log_scales), np.zeros((0, 3)) if points is None else points)
+    return problem, R, gauged(p)
 
 
 def directions_of(problem, R, p):
-    return cameras_at(R, p).relative(problem.edges)[1]
+    return Cameras(R, p, np.zeros(2)).relative(problem.edges)[1]
 
 
-def shared_points(problem, R, p, seed, *, num_points=60, sigma_px=0.0):
-    """The same cameras with points that all images see, as a problem and its tracks."""
+def with_triplets(problem, R, p, points, *, sigma_px=0.0, seed=0):
+    """The same cameras with given points that all images see, and the triplets that share them."""
     rng = np.random.default_rng(seed)
-    n, edges = len(R), problem.edges
-    local = np.einsum("nab,nkb->nka", R, rng.uniform(-0.4, 0.4, (num_points, 3))[None] - p[:, None])
+    n, k, edges = len(R), len(points), problem.edges
+    local = np.einsum("nab,nkb->nka", R, points[None] - p[:, None])
     plane = local / local[..., 2:]
-    plane[..., :2] += sigma_px / problem.focal_lengths[0] * rng.standard_normal((n, num_points, 2))
+    plane[..., :2] += sigma_px / problem.focal_lengths[0] * rng.standard_normal((n, k, 2))
     rays = normalized(plane)
-    keypoints = np.tile(np.arange(num_points, dtype=np.int32), len(edges))
-    problem = replace(
-        problem,
-        offsets=num_points * np.arange(len(edges) + 1),
-        bearings1=rays[edges[:, 0]].reshape(-1, 3),
-        bearings2=rays[edges[:, 1]].reshape(-1, 3),
-    )
-    tracks = spread_tracks(n, edges, problem.offsets, keypoints, keypoints, problem.bearings1, problem.bearings2)
-    return problem, tracks
+    keypoints = np.tile(np.arange(k, dtype=np.int32), len(edges))
+    offsets, rays1, rays2 = k * np.arange(len(edges) + 1), *(rays[edges[:, s]].reshape(-1, 3) for s in (0, 1))
+    i, j = edges.T
+    triplets = find_triplets(edges, offsets, keypoints, keypoints, rays1, rays2, R[j] @ np.swapaxes(R[i], 1, 2))
+    return replace(problem, offsets=offsets, bearings1=rays1, bearings2=rays2, triplets=triplets)
 
 
 def disturbed(R, p, seed, amount):
@@ -75,33 +66,28 @@ def disturbed(R, p, seed, amount):
     return so3.exp(amount * rng.standard_normal((len(R), 3))) @ R, p + amount * rng.standard_normal(p.shape)
 
 
-@pytest.mark.parametrize("with_tracks", [False, True])
+@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("free", [False, True])
-def test_gradient_is_that_of_finite_differences(free, with_tracks):
+def test_gradient_is_that_of_finite_differences(free, shared):
     problem, R, p = scene(1, sigma_px=1.0, free=free)
-    tracks, points = None, None
-    if with_tracks:
-        problem, tracks = shared_points(problem, R, p, seed=1)
-        points = triangulated(tracks, R, p)
+    if shared:
+        points = np.random.default_rng(3).uniform(-0.3, 0.3, (25, 3))
+        problem = with_triplets(problem, R, p, points, sigma_px=1.0)
+        assert len(problem.triplets.images) > len(R)
     R, p = disturbed(R, p, 2, 0.02)
-    at = cameras_at(R, p, (0.05, -0.03) if free else (0.0, 0.0), points)
+    at = Cameras(R, gauged(p), np.array([0.05, -0.03]) if free else np.zeros(2))
     size = 6 * len(R) + (2 if free else 0)
-    found = linearized(problem, at, 3.0, tracks)
-    assert found.cost == pytest.approx(cost_of(problem, at, 3.0, tracks), rel=1e-12)
-    assert found.gradient.shape == (size,)
-    free_rows = np.flatnonzero(problem.free_focals)
+    _, gradient = cost_and_gradient(problem, at, 3.0)
+    assert gradient.shape == (size,)
     rng = np.random.default_rng(0)
-    for direction in (*np.eye(size)[:: 5 if free else 7], *np.eye(size)[-2:], *rng.standard_normal((3, size))):
-        step = 1e-6 * direction / np.linalg.norm(direction)
-        ahead, behind = (cost_of(problem, at.moved(sign * step, free_rows), 3.0, tracks) for sign in (1, -1))
-        assert (ahead - behind) / 4.0 == pytest.approx(
-            found.gradient @ step, rel=1e-4, abs=1e-11 * np.abs(found.gradient).max()
+    for step in (*np.eye(size)[:: 5 if free else 7], *np.eye(size)[-2:], *rng.standard_normal((3, size))):
+        step = 1e-6 * step / np.linalg.norm(step)
+        (ahead, _), (behind, _) = (
+            cost_and_gradient(problem, at.moved(sign * step, np.flatnonzero(problem.free_focals)), 3.0)
+            for sign in (1, -1)
         )
-    if tracks is not None and found.tracks is not None:
-        step = 1e-6 * rng.standard_normal(points.shape)
-        still = np.zeros(size)
-        ahead, behind = (cost_of(problem, at.moved(still, free_rows, sign * step), 3.0, tracks) for sign in (1, -1))
-        assert (ahead - behind) / 4.0 == pytest.approx(found.tracks.point_gradient @ step.ravel(), rel=1e-4)
+        slope = (ahead - behind) / 2.0
+        assert slope == pytest.approx(gradient @ step, rel=1e-4, abs=1e-5 * np.abs(gradient).max() * 1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -142,8 +128,11 @@ def test_world_frame_and_scale_change_nothing_but_the_frame():
     R0, p0 = disturbed(R, p, 7, 0.03)
     turn = so3.exp(np.array([[0.4, -1.0, 2.0]]))[0]
     directions = directions_of(problem, R, p)
-    one = adjust_epipolar(problem, R0, p0, directions)
-    two = adjust_epipolar(problem, R0 @ turn.T, 5.0 * p0 @ turn.T + 3.0, directions)
+    # Where a scale's minimum is called reached depends on the frame's axes, and so does the noise found there: fix it.
+    one, two = (
+        adjust_epipolar(problem, *cameras, directions, scales_px=(8.0, 2.0, 1.0), final_sigmas=0.0)
+        for cameras in ((R0, p0), (R0 @ turn.T, 5.0 * p0 @ turn.T + 3.0))
+    )
     assert two.cost == pytest.approx(one.cost, rel=1e-6)
     assert align_positions(two.projection_centers, one.projection_centers)[0].max() < 1e-4
 
@@ -188,7 +177,9 @@ def test_false_pairs_move_the_cameras_little():
 def test_minimum_is_that_of_a_general_solver():
     problem, R, p = scene(11, num_images=5, num_matches=15, sigma_px=1.0)
     start = disturbed(R, p, 11, 0.01)
-    found = adjust_epipolar(problem, *start, directions_of(problem, R, p), scales_px=(1.0,), tolerance=1e-13)
+    found = adjust_epipolar(
+        problem, *start, directions_of(problem, R, p), scales_px=(1.0,), final_sigmas=0.0, tolerance=1e-13
+    )
     edge = np.repeat(np.arange(len(problem.edges)), np.diff(problem.offsets))
     i, j = problem.edges[edge].T
 
@@ -218,34 +209,77 @@ def test_nothing_to_adjust_is_an_error():
         adjust_epipolar(problem, R, np.zeros_like(p), directions_of(problem, R, p))
 
 
-def test_tracks_fix_what_a_line_of_cameras_leaves_open():
-    # Six cameras on a line, looking sideways: epipolar errors know every direction and no ratio of baselines.
+def line_of_cameras(*, sigma_px):
+    """Six cameras on a line that look sideways: epipolar errors know every direction and no ratio of baselines."""
     place = np.array([0.0, 1.0, 1.7, 3.0, 4.1, 5.0])
-    p = np.stack([place, np.zeros(6), np.zeros(6)], axis=1)
-    p = (p - p.mean(axis=0)) / 1.8
+    p = gauged(np.stack([place, np.zeros(6), np.zeros(6)], axis=1))
     R = np.tile(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), (6, 1, 1))
     edges = np.array([[i, j] for i in range(6) for j in range(i + 1, 6)])
-    points = np.random.default_rng(0).uniform([-1.5, 4.0, -1.0], [1.5, 7.0, 1.0], (200, 3))
-    local = np.einsum("nab,nkb->nka", R, points[None] - p[:, None])
-    rng = np.random.default_rng(1)
-    local = local / local[..., 2:]
-    local[..., :2] += 3e-4 * rng.standard_normal((6, 200, 2))
-    rays = normalized(local)
-    keypoints = np.tile(np.arange(200, dtype=np.int32), len(edges))
-    problem = EpipolarProblem(
-        6,
-        edges,
-        200 * np.arange(len(edges) + 1),
-        rays[edges[:, 0]].reshape(-1, 3),
-        rays[edges[:, 1]].reshape(-1, 3),
-        np.zeros(6, dtype=int),
-        np.array([1000.0]),
-        np.array([False]),
+    empty = np.zeros((0, 3))
+    bare = EpipolarProblem(
+        6, edges, np.zeros(16, int), empty, empty, np.zeros(6, int), np.array([1000.0]), np.zeros(1, bool)
     )
-    bent = p + np.array([[0.0, 0, 0], [0.15, 0, 0], [-0.1, 0, 0], [0.1, 0, 0], [-0.2, 0, 0], [0.0, 0, 0]])
-    directions = Cameras(R, p, np.zeros(1), np.zeros((0, 3))).relative(edges)[1]
-    tracks = spread_tracks(6, edges, problem.offsets, keypoints, keypoints, problem.bearings1, problem.bearings2)
-    without = adjust_epipolar(problem, R, bent, directions)
-    found = adjust_epipolar(problem, R, bent, directions, tracks=tracks)
+    points = np.random.default_rng(0).uniform([-1.5, 4.0, -1.0], [1.5, 7.0, 1.0], (200, 3))
+    bent = p + np.array([0.0, 0.15, -0.1, 0.1, -0.2, 0.0])[:, None] * [1.0, 0.0, 0.0]
+    return with_triplets(bare, R, p, points, sigma_px=sigma_px), R, p, bent
+
+
+def test_triplets_fix_the_ratios_of_baselines_on_a_line():
+    problem, R, p, bent = line_of_cameras(sigma_px=0.3)
+    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
+    found = adjust_epipolar(problem, R, bent, directions)
+    without = adjust_epipolar(replace(problem, triplets=None), R, bent, directions)
     with_error, without_error = (align_positions(f.projection_centers, p)[0].max() for f in (found, without))
-    assert with_error < 0.3 * without_error
+    # Depth 5, baselines of 0.5, 60 tracks at 0.3 px: a baseline's ratio is known to about 5 / 0.5 * 3e-4 / sqrt(60).
+    assert with_error < 3e-3
+    assert without_error > 0.05
+    exact, *_, start = line_of_cameras(sigma_px=0.0)
+    found = adjust_epipolar(exact, R, start, directions, tolerance=1e-12)
+    assert align_positions(found.projection_centers, p)[0].max() < 1e-7
+
+
+def test_triplets_of_coinciding_cameras_keep_everything_finite():
+    problem, R, p, bent = line_of_cameras(sigma_px=0.3)
+    bent[1] = bent[0]
+    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
+    cost, gradient = cost_and_gradient(problem, Cameras(R, bent, np.zeros(1)), 2.0)
+    assert np.isfinite(cost)
+    assert np.isfinite(gradient).all()
+    # A direction over a distance of nothing would pull a million times harder than those of cameras apart.
+    apart = bent.copy()
+    apart[1, 0] += 0.2
+    usual = cost_and_gradient(problem, Cameras(R, apart, np.zeros(1)), 2.0)[1]
+    assert np.abs(gradient).max() < 100.0 * np.abs(usual).max()
+    assert np.isfinite(adjust_epipolar(problem, R, bent, directions).projection_centers).all()
+
+
+def test_triplets_leave_with_their_edges():
+    problem, *_ = line_of_cameras(sigma_px=0.0)
+    dropped = np.zeros(15, bool)
+    dropped[4] = True
+    left = problem.without(dropped)
+    used = problem.triplets.edges
+    assert len(left.triplets.images) == int((used != 4).all(axis=1).sum()) < len(used)
+    # Each triplet's two edges still join its images.
+    a, b, c = left.triplets.images.T
+    for column, other in ((0, a), (1, c)):
+        joined = np.sort(left.edges[left.triplets.edges[:, column]], axis=1)
+        np.testing.assert_array_equal(joined, np.sort(np.stack([other, b], axis=1), axis=1))
+    assert problem.without(np.arange(15) > 0).triplets is None
+
+
+def test_last_scale_follows_the_noise_of_the_matches():
+    # A fifth of the matches a pixel or two off, all to one side: at a fixed pixel they bend what the others tell.
+    problem, R, p = scene(13, num_images=10, num_matches=60, sigma_px=0.1)
+    rng = np.random.default_rng(0)
+    wrong = rng.random(len(problem.bearings2)) < 0.2
+    shift = np.where(wrong, rng.uniform(1.0, 2.0, len(wrong)), 0.0) / 1000.0
+    off = normalized(problem.bearings2 + shift[:, None] * [0.6, 0.8, 0.0])
+    problem = replace(problem, bearings2=off)
+    start, directions = disturbed(R, p, 13, 0.02), directions_of(problem, R, p)
+    followed = adjust_epipolar(problem, *start, directions)
+    fixed = adjust_epipolar(problem, *start, directions, scales_px=(8.0, 2.0, 1.0), final_sigmas=0.0)
+    assert (
+        align_positions(followed.projection_centers, p)[0].mean()
+        < 0.5 * align_positions(fixed.projection_centers, p)[0].mean()
+    )

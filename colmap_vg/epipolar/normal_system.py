@@ -1,0 +1,147 @@
+"""Sparse normal equations of cameras and shared focal lengths, from terms that each see two or three cameras."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
+from colmap_vg.linear.solvers import SingularMatrixError, factorize
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MIN_DAMPING = 1e-9
+"""Share of the Hessian's diagonal that is always added: the gauge leaves seven directions free."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraTerms:
+    """Terms of a cost that see s cameras each, and their derivatives.
+
+    Attributes
+    ----------
+    images : (q, s) int64 array
+    costs : (q,) array
+    pose_gradients : (q, 6 s) array
+        By turn and shift of each image.
+    focal_gradients : (q, s) array
+        By the logarithms of the focal lengths of the images' cameras; zero where they are held.
+    pose_blocks : (q, 6 s, 6 s) array
+    cross_blocks : (q, 6 s, s) array
+    focal_blocks : (q, s, s) array
+    """
+
+    images: IntArray
+    costs: Array
+    pose_gradients: Array
+    focal_gradients: Array
+    pose_blocks: Array
+    cross_blocks: Array
+    focal_blocks: Array
+
+    @classmethod
+    def chained(cls, images: IntArray, costs: Array, gradients: Array, hessians: Array, chain: Array) -> "CameraTerms":
+        """From derivatives (q, b + s) by b parameters and s log focals, and those of the parameters (q, b, 6 s)."""
+        q, b, _ = chain.shape
+        s = images.shape[1]
+        turned = np.swapaxes(chain, 1, 2)
+        with_focals = gradients.shape[1] > b
+        return cls(
+            images,
+            costs,
+            (gradients[:, None, :b] @ chain)[:, 0],
+            gradients[:, b:] if with_focals else np.zeros((q, s)),
+            turned @ hessians[:, :b, :b] @ chain,
+            turned @ hessians[:, :b, b:] if with_focals else np.zeros((q, 6 * s, s)),
+            hessians[:, b:, b:] if with_focals else np.zeros((q, s, s)),
+        )
+
+
+class NormalSystem:
+    """Gradients and Levenberg steps on the pattern of given terms, sorted once.
+
+    Parameters
+    ----------
+    num_images : int
+    images : sequence of (q, s) int64 arrays
+        One for each kind of terms.
+    camera_idx : (n,) int64 array
+    free : (f,) int64 array
+        Cameras whose focal lengths are unknowns.
+    num_cameras : int
+    """
+
+    def __init__(
+        self, num_images: int, images: Sequence[IntArray], camera_idx: IntArray, free: IntArray, num_cameras: int
+    ) -> None:
+        self.num_images, self.free = num_images, free
+        place = np.full(num_cameras, -1)
+        place[free] = np.arange(len(free))
+        self._slots = [place[camera_idx[i]] for i in images]
+        self._pattern = BlockPattern(num_images, np.concatenate([_pairs(i) for i in images]), 6)
+
+    def gradient(self, terms: Sequence[CameraTerms]) -> Array:
+        """Sum of the terms' gradients: (6 n + f,)."""
+        poses, focals = np.zeros((self.num_images, 6)), np.zeros(len(self.free))
+        for term, slot in zip(terms, self._slots, strict=True):
+            poses += sum_at_nodes(self.num_images, term.images.ravel(), term.pose_gradients.reshape(-1, 6))
+            used = slot >= 0
+            if len(self.free):
+                focals += sum_at_nodes(len(self.free), slot[used], term.focal_gradients[used])
+        return np.concatenate([poses.ravel(), focals])
+
+    def step(self, terms: Sequence[CameraTerms], gradient: Array, damping: float) -> Array | None:
+        """Levenberg's step (6 n + f,), each diagonal entry raised by its share; None where that does not suffice."""
+        n = self.num_images
+        blocks = [np.concatenate(part) for part in zip(*(_split(t.pose_blocks) for t in terms), strict=True)]
+        ii, jj, ij = blocks
+        diagonal = np.zeros((n, 6))
+        for t in terms:
+            own = np.einsum("kaa->ka", t.pose_blocks).reshape(-1, 6)
+            diagonal += sum_at_nodes(n, t.images.ravel(), own)
+        level = damping * diagonal + MIN_DAMPING * diagonal.max(axis=0)
+        matrix = self._pattern.assemble(ii, jj, ij, level[:, :, None] * np.eye(6))
+        if len(self.free):
+            matrix = self._bordered(matrix, terms, damping)
+        try:
+            return -factorize(matrix, in_loop=True).solve(gradient)
+        except SingularMatrixError:
+            return None
+
+    def _bordered(self, poses: sp.csc_array, terms: Sequence[CameraTerms], damping: float) -> sp.csc_array:
+        n, f = self.num_images, len(self.free)
+        cross, focal = sp.csc_array((6 * n, f)), sp.csc_array((f, f))
+        for term, slot in zip(terms, self._slots, strict=True):
+            unknown = (6 * term.images[:, :, None] + np.arange(6)).reshape(len(slot), -1)
+            cross = cross + _scattered(term.cross_blocks, unknown, slot, (6 * n, f))
+            focal = focal + _scattered(term.focal_blocks, slot, slot, (f, f))
+        level = focal.diagonal() * damping
+        focal = focal + sp.diags_array(level + 1e-12 * max(float(focal.diagonal().max()), 1e-300))
+        return sp.csc_array(sp.block_array([[poses, cross], [cross.T, focal]]))
+
+
+def _pairs(images: IntArray) -> IntArray:
+    """Pairs of cameras in the order of `_split`."""
+    if images.shape[1] == 2:
+        return images
+    return np.concatenate([images[:, [s, (s + 1) % 3]] for s in range(3)])
+
+
+def _split(blocks: Array) -> tuple[Array, Array, Array]:
+    """Blocks of pairs, with each camera's own in one of its pairs: ii, jj, ij."""
+    if blocks.shape[1] == 12:
+        return blocks[:, :6, :6], blocks[:, 6:, 6:], blocks[:, :6, 6:]
+    parts = [slice(0, 6), slice(6, 12), slice(12, 18)]
+    own = np.concatenate([blocks[:, s, s] for s in parts])
+    across = np.concatenate([blocks[:, parts[s], parts[(s + 1) % 3]] for s in range(3)])
+    return own, np.zeros_like(own), across
+
+
+def _scattered(blocks: Array, rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> sp.csc_array:
+    """Sum of dense blocks (q, a, b) at rows (q, a) and columns (q, b), those at -1 left out."""
+    row, column = np.broadcast_to(rows[:, :, None], blocks.shape), np.broadcast_to(columns[:, None, :], blocks.shape)
+    used = (row >= 0) & (column >= 0)
+    return sp.csc_array(sp.coo_array((blocks[used], (row[used], column[used])), shape=shape))

@@ -1,0 +1,158 @@
+"""Triplets of images (a, b, c) that share tracks through b, chosen by how well they tell the ratio of two baselines.
+
+A half-edge is an edge seen from one of its images. Two half-edges of an image b that match the same keypoints make a
+triplet, whether or not a and c are matched. Its worth is ``sum sin(theta_a) sin(theta_c)`` over the shared keypoints,
+theta the angles between the rays of a point: the information on the ratio grows with both.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_of_rows, segment_subset, segment_sums
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+HALF_EDGES_PER_IMAGE = 24
+"""Half-edges of an image that are paired, those of most worth: pairs grow with the square of their number."""
+TRIPLETS_PER_IMAGE = 12
+TRACKS_PER_TRIPLET = 60
+MIN_TRACKS = 10
+"""Fewer shared keypoints make no triplet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Triplets:
+    """Triplets and their tracks.
+
+    Attributes
+    ----------
+    images : (q, 3) int64 array
+        a, b, c; b sees the tracks in both edges.
+    edges : (q, 2) int64 array
+        The edges of a and b, and of b and c.
+    offsets : (q + 1,) int64 array
+        Tracks of triplet k are rows ``offsets[k]:offsets[k + 1]``.
+    bearings : (3, 3, k) array
+        Unit rays in a, b and c; components second.
+    """
+
+    images: IntArray
+    edges: IntArray
+    offsets: IntArray
+    bearings: Array
+
+    def without(self, dropped: BoolArray) -> "Triplets":
+        """The same without those that use a dropped edge (m,), the edges left numbered anew."""
+        kept = np.flatnonzero(~dropped[self.edges].any(axis=1))
+        rows, offsets = rows_of_segments(self.offsets, kept)
+        number = np.cumsum(~dropped) - 1
+        return replace(
+            self,
+            images=self.images[kept],
+            edges=number[self.edges[kept]],
+            offsets=offsets,
+            bearings=self.bearings[:, :, rows],
+        )
+
+
+def find_triplets(
+    edges: IntArray,
+    offsets: IntArray,
+    keypoints1: NDArray[np.int32],
+    keypoints2: NDArray[np.int32],
+    bearings1: Array,
+    bearings2: Array,
+    relative_rotations: Array,
+) -> Triplets:
+    """Choose triplets by the worth of their shared tracks.
+
+    Parameters
+    ----------
+    edges : (m, 2) int64 array
+    offsets : (m + 1,) int64 array
+    keypoints1, keypoints2 : (k,) int array
+        Keypoints of the matches in image 1 and image 2.
+    bearings1, bearings2 : (k, 3) array
+    relative_rotations : (m, 3, 3) array
+        cam2_from_cam1, to tell the angles between rays.
+
+    Returns
+    -------
+    Triplets
+        At most `TRIPLETS_PER_IMAGE` about each image, with at most `TRACKS_PER_TRIPLET` tracks each.
+    """
+    m, k = len(edges), len(bearings1)
+    turned = np.einsum("kab,kb->ka", relative_rotations[segment_of_rows(offsets)], bearings1)
+    sine = np.linalg.norm(np.cross(turned, bearings2), axis=1)
+    # Half-edges: those of the first images, then those of the second; rows of matches likewise.
+    middle, other = edges.T.ravel(), edges[:, ::-1].T.ravel()
+    half_offsets = np.concatenate([offsets, offsets[1:] + k])
+    keypoints = np.concatenate([keypoints1, keypoints2]).astype(np.int64)
+    chosen = _best_of_each(middle, segment_sums(half_offsets, np.tile(np.square(sine), 2)), HALF_EDGES_PER_IMAGE)
+    pairs = _worthy_pairs(middle[chosen], other[chosen], half_offsets, keypoints, np.tile(sine, 2), chosen)
+    first, second = _join(pairs, half_offsets, keypoints)
+    shared = np.concatenate([[0], np.cumsum(np.bincount(first[0], minlength=len(pairs)))]).astype(np.int64)
+    kept = evenly_thinned(shared, TRACKS_PER_TRIPLET)
+    of_other, of_middle = np.concatenate([bearings2, bearings1]), np.concatenate([bearings1, bearings2])
+    rows_a, rows_c = first[1][kept], second[kept]
+    return Triplets(
+        np.stack([other[pairs[:, 0]], middle[pairs[:, 0]], other[pairs[:, 1]]], axis=1),
+        pairs % m,
+        segment_subset(shared, kept),
+        np.stack([of_other[rows_a].T, of_middle[rows_a].T, of_other[rows_c].T]),
+    )
+
+
+def _worthy_pairs(
+    middle: IntArray,
+    other: IntArray,
+    half_offsets: IntArray,
+    keypoints: IntArray,
+    sine: Array,
+    chosen: IntArray,
+) -> IntArray:
+    """Pairs (q, 2) of half-edges that share keypoints of an image, the worthiest of each image, in rising order."""
+    rows, offsets = rows_of_segments(half_offsets, chosen)
+    width = int(keypoints.max(initial=0)) + 1
+    column = middle[segment_of_rows(offsets)] * width + keypoints[rows]
+    _, column = np.unique(column, return_inverse=True)
+    size = (len(chosen), int(column.max(initial=0)) + 1)
+    seen = sp.csr_array((sine[rows], column, offsets), shape=size)
+    ones = sp.csr_array((np.ones(len(rows)), column, offsets), shape=size)
+    count = sp.coo_array(sp.triu(ones @ ones.T, k=1))
+    a, c = count.coords
+    enough = (count.data >= MIN_TRACKS) & (other[a] != other[c])
+    a, c = a[enough].astype(np.int64), c[enough].astype(np.int64)
+    if len(a) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    worth = sp.csr_array(seen @ seen.T)
+    best = _best_of_each(middle[a], np.asarray(worth[a, c]).ravel(), TRIPLETS_PER_IMAGE)
+    return np.stack([chosen[a[best]], chosen[c[best]]], axis=1)
+
+
+def _join(pairs: IntArray, half_offsets: IntArray, keypoints: IntArray) -> tuple[tuple[IntArray, IntArray], IntArray]:
+    """Matches that two half-edges have in common: (pair, row in the first), row in the second."""
+    width = int(keypoints.max(initial=0)) + 1
+    used = np.unique(pairs)
+    rows, offsets = rows_of_segments(half_offsets, used)
+    key = segment_of_rows(offsets) * width + keypoints[rows]
+    order = np.argsort(key, kind="stable")
+    key, sorted_rows = key[order], rows[order]
+    mine, mine_offsets = rows_of_segments(half_offsets, pairs[:, 0])
+    pair = segment_of_rows(mine_offsets)
+    wanted = np.searchsorted(used, pairs[:, 1])[pair] * width + keypoints[mine]
+    place = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
+    hit = key[place] == wanted if len(key) else np.zeros(0, dtype=bool)
+    return (pair[hit], mine[hit]), sorted_rows[place[hit]]
+
+
+def _best_of_each(group: IntArray, worth: Array, limit: int) -> IntArray:
+    """Members of the highest worth in each group, at most `limit`, in rising order."""
+    order = np.lexsort((-worth, group))
+    starts = np.searchsorted(group[order], group[order], side="left")
+    return np.sort(order[np.arange(len(order)) - starts < limit])
