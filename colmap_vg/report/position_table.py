@@ -124,15 +124,18 @@ def median_over_seeds(rows: Sequence[MethodErrors]) -> list[MethodErrors]:
 
     return [
         MethodErrors(
-            dataset,
-            len(group),
-            method,
-            round(middle(group, "num_edges")),
-            round(middle(group, "num_images")),
-            *(middle(group, name) for name in ("rms", "mean", "median", "rotation_median_deg")),
-            round(middle(group, "num_iterations")),
-            all(row.converged for row in group),
-            middle(group, "seconds"),
+            dataset=dataset,
+            seed=len(group),
+            method=method,
+            num_edges=round(middle(group, "num_edges")),
+            num_images=round(middle(group, "num_images")),
+            rms=middle(group, "rms"),
+            mean=middle(group, "mean"),
+            median=middle(group, "median"),
+            rotation_median_deg=middle(group, "rotation_median_deg"),
+            num_iterations=round(middle(group, "num_iterations")),
+            converged=all(row.converged for row in group),
+            seconds=middle(group, "seconds"),
         )
         for (dataset, method), group in groups.items()
     ]

@@ -85,7 +85,9 @@ def real_scene(folder: str | PathLike[str]) -> KnownScene:
             R[row], p[row] = poses[image]
     scene = KnownScene(folder.name, graph, R, p)
     if scene.known.sum() < 3:
-        raise DataFileError(f"{folder / 'gt_bundle.out'}: poses of {scene.known.sum()} images of the graph, needs three")
+        raise DataFileError(
+            f"{folder / 'gt_bundle.out'}: poses of {scene.known.sum()} images of the graph, needs three"
+        )
     return scene
 
 

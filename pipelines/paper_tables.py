@@ -1,0 +1,95 @@
+"""Tables and figures of the paper: ``python pipelines/paper_tables.py --topology FOLDER --output_path OUT``.
+
+On 1DSfM folders with truth (``--data FOLDER ...``, each with EGs.txt and gt_bundle.out), or on cameras simulated on the
+topologies of real sets (``--topology``). Writes Markdown, CSV and SVG to OUT/tables.
+"""
+
+import argparse
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import get_args
+
+import colmap_vg
+from colmap_vg.options import Method
+from colmap_vg.report.paper import SceneJob, SceneReport, measure_or_load, refuse_tables, write_tables
+from colmap_vg.report.position_table import PAPER_METHODS
+from colmap_vg.report.scenes import TABLE_1_SETS, set_conditions
+
+
+def main() -> None:
+    """Run the pipeline."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--data", type=Path, nargs="+", help="1DSfM folders with gt_bundle.out")
+    source.add_argument("--topology", type=Path, help="folder of .mat adjacencies to simulate on")
+    parser.add_argument("--output_path", type=Path, required=True, help="receives the folder tables")
+    parser.add_argument("--sets", nargs="+", default=list(TABLE_1_SETS), help="of the topology; default: Table 1's")
+    parser.add_argument("--seeds", type=int, default=5, help="simulations of each set")
+    methods = [method for method in get_args(Method) if method != "epipolar"]
+    parser.add_argument("--methods", nargs="+", default=list(PAPER_METHODS), choices=methods)
+    parser.add_argument("--six_vertex_draws", type=int, default=500, help="of Fig. 4; 0 leaves it out")
+    parser.add_argument("--num_threads", type=int, default=1, help="scenes solved at once")
+    parser.add_argument("--resume", action="store_true", help="take up scenes that an earlier run finished")
+    parser.add_argument("--overwrite", action="store_true", help="replace tables that are there already")
+    arguments = parser.parse_args()
+    if arguments.seeds < 1 or arguments.num_threads < 1 or arguments.six_vertex_draws < 0:
+        parser.error("--seeds and --num_threads must be at least 1, --six_vertex_draws at least 0")
+    methods_wanted = tuple(dict.fromkeys(arguments.methods))
+    try:
+        refuse_tables(arguments.output_path, arguments.overwrite)
+        if arguments.data:
+            jobs = [SceneJob(folder.name, str(folder), None, methods_wanted) for folder in arguments.data]
+        else:
+            for name in arguments.sets:
+                set_conditions(arguments.topology, name)  # says of an unknown set before any work is done
+            jobs = [
+                SceneJob(name, str(arguments.topology), seed, methods_wanted)
+                for name in arguments.sets
+                for seed in range(arguments.seeds)
+            ]
+        work = arguments.output_path / ".work"
+        work.mkdir(parents=True, exist_ok=True)
+        reports = {}
+        for job, report in measured(jobs, work, arguments.resume, arguments.num_threads):
+            reports[job] = report
+            medians = ", ".join(f"{row.method} {row.median:.3g}" for row in report.rows)
+            print(f"{job.dataset} {'' if job.seed is None else job.seed}: median errors {medians}", flush=True)
+        folder = write_tables(
+            arguments.output_path,
+            [reports[job] for job in jobs],
+            six_vertex_methods=methods_wanted if arguments.six_vertex_draws else (),
+            num_draws=arguments.six_vertex_draws,
+            overwrite=arguments.overwrite,
+        )
+    except colmap_vg.ColmapVgError as error:
+        sys.exit(f"error: {error}")
+    except OSError as error:
+        sys.exit(f"error: {error.strerror}: {error.filename}")
+    print(folder / "tables.md")
+
+
+def measured(
+    jobs: list[SceneJob], work: Path, resume: bool, num_threads: int
+) -> Iterator[tuple[SceneJob, SceneReport]]:
+    """Jobs with their reports, as they finish."""
+    if num_threads == 1:
+        for job in jobs:
+            yield job, measure_or_load(job, work, resume)
+        return
+    os.environ["OMP_NUM_THREADS"] = "1"  # for the processes to come: one scene each, one thread each
+    with ProcessPoolExecutor(num_threads, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = {pool.submit(measure_or_load, job, work, resume): job for job in jobs}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+if __name__ == "__main__":
+    main()
