@@ -16,6 +16,8 @@ IntArray = NDArray[np.int64]
 
 RESIDUAL_FLOOR = 1e-3
 """Residuals below this (in the unit of the shortest lambda) weigh as least squares."""
+ROUGH_TOLERANCE, FINAL_TOLERANCE = 1e-6, 1e-12
+"""Of CLS while the weights still change, and of the last reweightings: what is left of exact data is rounding."""
 
 
 def solve_lud(
@@ -56,18 +58,20 @@ def solve_lud(
     i, j = edges[:, 0], edges[:, 1]
     log: list[LogEntry] = []
     p: Array | None = None
-    reweighted, converged = w, False
+    reweighted, converged, inner_tolerance = w, False, ROUGH_TOLERANCE
     for iteration in range(max_num_iterations):
         result = solve_cls(
-            num_images, edges, directions_world, reweighted, initial_centers=p, tolerance=min(1e-6, tolerance)
+            num_images, edges, directions_world, reweighted, initial_centers=p, tolerance=inner_tolerance
         )
         new = result.projection_centers
         change = np.inf if p is None else float(np.linalg.norm(new - p)) / spread(new)
         p = new
         residual = np.linalg.norm(p[j] - p[i] - result.lambdas[:, None] * directions_world, axis=1)
         log.append(LogEntry("lud", iteration, float(np.sum(w * residual)), change))
-        if change <= tolerance:
+        if change <= tolerance and inner_tolerance == FINAL_TOLERANCE:
             converged = True
             break
+        if change <= tolerance:
+            inner_tolerance = FINAL_TOLERANCE
         reweighted = w / np.maximum(residual, RESIDUAL_FLOOR)
     return PositionResult(result.projection_centers, result.lambdas, log[-1].cost, len(log), converged, tuple(log))
