@@ -114,7 +114,8 @@ def solve_joint(
     unit = size / np.sqrt(num_images)
     shortest = MIN_RELATIVE_LENGTH * unit
     log: list[LogEntry] = []
-    inner_tolerance, last_cost = 1e-6, np.inf
+    # The plain form solves every inner problem well, as the paper has it; the accelerated one as the moment deserves.
+    inner_tolerance, last_cost, shrinkage = 1e-3 if accelerate else 1e-6, np.inf, 1.0
 
     def pack(Q: Array, p: Array) -> Array:
         return np.concatenate([so3.log(Q @ np.swapaxes(start_Q, 1, 2)), p / unit], axis=1)
@@ -123,7 +124,7 @@ def solve_joint(
         return so3.exp(x[:, :3]) @ start_Q, x[:, 3:] * unit
 
     def iterate(x: Array) -> Array:
-        nonlocal last_cost
+        nonlocal last_cost, shrinkage
         Q, p = unpack(x)
         length = np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
         tau = w if approach == "C" else w / length**2
@@ -135,16 +136,18 @@ def solve_joint(
             root = np.sqrt(np.repeat(np.stack([kappa, tau], axis=1), 3, axis=1))
             weighted = root[:, :, None] * known * root[:, None, :]
             cost = InformationCost(edges, cam2_from_cam1_rotations, translations, weighted)
-        Q, p, inner = solver.solve(cost, Q, p, tolerance=inner_tolerance)
+        # At the fixed point the inner minimum is p, shrunk as in the last turn: from there few steps are left.
+        Q, p, inner = solver.solve(cost, Q, p * shrinkage, tolerance=inner_tolerance)
         last_cost = inner.cost
         # The global rotation is free: hold the first camera, so that the iteration has one fixed point.
         turn = start_Q[0] @ Q[0].T
         Q, p = turn @ Q, centered(p @ turn.T)
-        return pack(Q, p * (size / spread(p)))
+        shrinkage = spread(p) / size
+        return pack(Q, p / shrinkage)
 
     def note(iteration: int, _: Array, change: float) -> None:
         nonlocal inner_tolerance
-        inner_tolerance = min(inner_tolerance, max(1e-3 * change, 1e-13))
+        inner_tolerance = min(inner_tolerance, max((1e-2 if accelerate else 1e-3) * change, 1e-13))
         log.append(LogEntry("2" + approach, iteration, last_cost, change))
 
     x, count, converged = fixed_point(

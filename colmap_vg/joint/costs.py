@@ -40,7 +40,7 @@ class EdgeTerms:
     gradient_i, gradient_j : (m, 6) array
     ii, jj, ij : (m, 6, 6) array
         Positive semidefinite approximation of the Hessian.
-    curvature_ii, curvature_ij : (m, 3, 3) array or None
+    curvature_ii, curvature_jj, curvature_ij : (m, 3, 3) array or None
         What its rotation blocks lack of the exact Hessian; it may be indefinite.
     """
 
@@ -50,6 +50,7 @@ class EdgeTerms:
     jj: Array
     ij: Array
     curvature_ii: Array | None = None
+    curvature_jj: Array | None = None
     curvature_ij: Array | None = None
 
 
@@ -105,7 +106,8 @@ class ChordalCost:
         # Exact Hessian of the chordal term by u while it is safely definite, Gauss-Newton's of the translations.
         trace = np.trace(M, axis1=1, axis2=2)[:, None, None]
         exact = trace * np.eye(3) - 0.5 * (M + np.swapaxes(M, 1, 2))
-        C = 2.0 * self.kappa[:, None, None] * np.where(trace > MIN_TRACE, exact, 2.0 * np.eye(3))
+        bent = 2.0 * self.kappa[:, None, None] * exact
+        C = np.where(trace > MIN_TRACE, bent, 4.0 * self.kappa[:, None, None] * np.eye(3))
         S, weight = so3.hat(s), 2.0 * self.tau[:, None, None]
         ii, jj, ij = (np.zeros((len(s), 6, 6)) for _ in range(3))
         ii[:, :3, :3] = C + weight * (np.swapaxes(S, 1, 2) @ S)
@@ -119,10 +121,10 @@ class ChordalCost:
         # exp(-w_j) exp(w_i) turns by w_i - w_j - (w_j x w_i) / 2 + ..., and Q_i t moves by w_i x (w_i x s) / 2 as well.
         outer = pull[:, :, None] * s[:, None, :]
         along = np.einsum("ka,ka->k", pull, s)[:, None, None] * np.eye(3)
-        curvature_ii = 0.5 * (outer + np.swapaxes(outer, 1, 2)) - along
-        return EdgeTerms(
-            gradient_i, gradient_j, ii, jj, ij, curvature_ii, 2.0 * self.kappa[:, None, None] * so3.hat(skew)
-        )
+        curvature_jj = bent - C
+        curvature_ii = 0.5 * (outer + np.swapaxes(outer, 1, 2)) - along + curvature_jj
+        curvature_ij = 2.0 * self.kappa[:, None, None] * so3.hat(skew) - curvature_jj
+        return EdgeTerms(gradient_i, gradient_j, ii, jj, ij, curvature_ii, curvature_jj, curvature_ij)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,20 +3,23 @@
 The objectives are in :mod:`colmap_vg.joint.costs`. Steps ``Q <- exp(w) Q, p <- p + x`` are Levenberg-Marquardt ones on
 sparse 6 x 6 blocks, Newton's near the end, with the first camera held; a step that raises the cost is refused. Where
 cost differences drown in rounding the gradient decides, so that the minimum is reached to rounding and not to its
-square root.
+square root. Newton's systems are solved by conjugate gradients under the last factor as long as it serves: Alg. 2 calls
+for hundreds of problems that differ little.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.joint.costs import ChordalCost, EdgeTerms, InformationCost, PoseGraphCost
 from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
-from colmap_vg.linear.solvers import SingularMatrixError, factorize
+from colmap_vg.linear.reweighted import conjugate_gradients
+from colmap_vg.linear.solvers import Factor, SingularMatrixError, factorize
 from colmap_vg.positions.result import check_connected, unit_weights
 from colmap_vg.solution import LogEntry
 
@@ -27,6 +30,8 @@ MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
 """Shares of the Hessian's diagonal."""
 NEWTON_BELOW = 1e-2
 """Size of the gradient from which on the exact Hessian is tried: Gauss-Newton's took 50 to 100 steps to the end."""
+CG_TOLERANCE, MAX_CG_ITERATIONS = 1e-4, 12
+"""Relative residual of Newton's systems under a stale factor, and products after which it is made anew."""
 COST_ROUNDING = 1e-12
 """Relative differences of costs below this are rounding: sums over up to a million edges."""
 
@@ -85,6 +90,7 @@ class PoseGraphSolver:
         check_connected(num_images, edges)
         self.num_images, self.edges = num_images, edges
         self._pattern = BlockPattern(num_images, edges, 6)
+        self._stale: Factor | None = None
 
     def gradient(self, cost: PoseGraphCost, Q: Array, p: Array) -> Array:
         """Gradient (n, 6) by w (first three) and x (last three) in ``Q <- exp(w) Q, p <- p + x``."""
@@ -140,28 +146,52 @@ class PoseGraphSolver:
     def _trial_steps(self, at: _Linearization, damping: float) -> Iterator[tuple[float, Array]]:
         """Steps (n, 6) to be tried in turn: Newton's where it may serve, then Levenberg's with growing damping."""
         terms = at.terms
-        if at.size < NEWTON_BELOW and terms.curvature_ii is not None and terms.curvature_ij is not None:
-            ii, ij = terms.ii.copy(), terms.ij.copy()
-            ii[:, :3, :3] += terms.curvature_ii
-            ij[:, :3, :3] += terms.curvature_ij
-            step = self._step(at, ii, ij, MIN_DAMPING)
+        if at.size < NEWTON_BELOW and terms.curvature_ii is not None:
+            step = self._newton_step(at)
             if step is not None and np.vdot(step, at.gradient) < 0.0:
                 yield damping, step
+            self._stale = None  # refused: the factor may be that of an indefinite matrix
         while damping <= MAX_DAMPING:
-            step = self._step(at, terms.ii, terms.ij, damping)
+            step = self._damped_step(at, damping)
             if step is not None:
                 yield damping, step
             damping *= 100.0
 
-    def _step(self, at: _Linearization, ii: Array, ij: Array, damping: float) -> Array | None:
-        level = damping * at.diagonal + MIN_DAMPING * at.diagonal.max(axis=0)
-        # The gauge leaves six directions free; extra stiffness at one camera fixes them and bends nothing else.
-        level[0] += at.diagonal[0] + at.diagonal.mean(axis=0)
+    def _newton_step(self, at: _Linearization) -> Array | None:
+        """Step by the exact Hessian; None where it is not definite."""
+        terms = at.terms
+        if terms.curvature_ii is None or terms.curvature_jj is None or terms.curvature_ij is None:
+            return None
+        ii, jj, ij = terms.ii.copy(), terms.jj.copy(), terms.ij.copy()
+        ii[:, :3, :3] += terms.curvature_ii
+        jj[:, :3, :3] += terms.curvature_jj
+        ij[:, :3, :3] += terms.curvature_ij
+        matrix = self._matrix(at, ii, jj, ij, MIN_DAMPING)
+        right = -at.gradient.ravel()
+        step = None
+        if self._stale is not None:
+            step = conjugate_gradients(matrix, right, self._stale, CG_TOLERANCE, MAX_CG_ITERATIONS)
+        if step is None:
+            self._stale = None  # frees the old factor before the new one is made
+            try:
+                self._stale = factorize(matrix)
+            except SingularMatrixError:
+                return None
+            step = self._stale.solve(right)
+        return step.reshape(-1, 6)
+
+    def _damped_step(self, at: _Linearization, damping: float) -> Array | None:
         try:
-            factor = factorize(self._pattern.assemble(ii, at.terms.jj, ij, level[:, :, None] * np.eye(6)), in_loop=True)
+            factor = factorize(self._matrix(at, at.terms.ii, at.terms.jj, at.terms.ij, damping))
         except SingularMatrixError:
             return None
         return -factor.solve(at.gradient.ravel()).reshape(-1, 6)
+
+    def _matrix(self, at: _Linearization, ii: Array, jj: Array, ij: Array, damping: float) -> sp.csc_array:
+        level = damping * at.diagonal + MIN_DAMPING * at.diagonal.max(axis=0)
+        # The gauge leaves six directions free; extra stiffness at one camera fixes them and bends nothing else.
+        level[0] += at.diagonal[0] + at.diagonal.mean(axis=0)
+        return self._pattern.assemble(ii, jj, ij, level[:, :, None] * np.eye(6))
 
 
 def solve_pose_graph(
