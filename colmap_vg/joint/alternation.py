@@ -20,7 +20,7 @@ from colmap_vg.geometry.directions import tangent_basis
 from colmap_vg.joint.costs import ChordalCost, InformationCost, PoseGraphCost
 from colmap_vg.joint.pose_graph import PoseGraphSolver
 from colmap_vg.linear.anderson import fixed_point
-from colmap_vg.positions.fixed_point import MIN_RELATIVE_LENGTH
+from colmap_vg.positions.fixed_point import MIN_RELATIVE_LENGTH, shortest_weighted_length
 from colmap_vg.positions.result import centered, spread, unit_weights
 from colmap_vg.solution import LogEntry
 
@@ -112,7 +112,7 @@ def solve_joint(
     start_Q, start_p = np.swapaxes(initial_rotations, 1, 2), centered(initial_centers)
     size = spread(start_p)
     unit = size / np.sqrt(num_images)
-    shortest = MIN_RELATIVE_LENGTH * unit
+    shortest, shortest_weighted = MIN_RELATIVE_LENGTH * unit, shortest_weighted_length(start_p, edges)
     log: list[LogEntry] = []
     # The plain form solves every inner problem well, as the paper has it; the accelerated one as the moment deserves.
     inner_tolerance, last_cost, shrinkage = 1e-3 if accelerate else 1e-6, np.inf, 1.0
@@ -127,7 +127,7 @@ def solve_joint(
         nonlocal last_cost, shrinkage
         Q, p = unpack(x)
         length = np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
-        tau = w if approach == "C" else w / length**2
+        tau = w if approach == "C" else w / np.maximum(length, shortest_weighted) ** 2
         translations = length[:, None] * cam2_in_cam1_directions
         cost: PoseGraphCost
         if known is None:

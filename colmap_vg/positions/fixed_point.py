@@ -3,7 +3,8 @@
 * **1C**, displacement error: ``lambda = ||p_j - p_i||``, then LS1, ``min_p sum w ||lambda gamma - (p_j - p_i)||^2``.
   Its matrix is one scalar Laplacian, factored once for all iterations and axes.
 * **1O**, direction error: ``lambda = 1 / ||p_j - p_i||``, then LS2, ``min_p sum w ||gamma - lambda (p_j - p_i)||^2``
-  (eq. Crs3), a Laplacian with weights ``w lambda^2``, factored in each iteration.
+  (eq. Crs3), a Laplacian with weights ``w lambda^2``, factored in each iteration. The weights have a bound, so that
+  cameras do not fall into one point.
 
 After each iteration the centroid goes to 0 and ``sum ||p||^2`` back to what the start had; nothing else keeps 1C from
 shrinking. The fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C
@@ -27,6 +28,9 @@ IntArray = NDArray[np.int64]
 
 MIN_RELATIVE_LENGTH = 1e-8
 """Edges shorter than this share of the spread count as this long: direction weights stay finite."""
+MIN_WEIGHTED_LENGTH = 1e-2
+"""Edges shorter than this share of the start's median edge weigh as if they were this long in 1O and 2O. Their own
+weight, one over the squared length, would draw two cameras with contradicting edges into one point, ever faster."""
 
 
 def solve_fixed_point(
@@ -73,6 +77,7 @@ def solve_fixed_point(
     w = unit_weights(weights, len(edges))
     start = centered(initial_centers)
     size = spread(start)
+    shortest = shortest_weighted_length(start, edges)
     system = LaplacianSystem(num_images, edges)
     fixed_factor = system.factor(w) if approach == "C" else None
     log: list[LogEntry] = []
@@ -82,7 +87,8 @@ def solve_fixed_point(
         if fixed_factor is not None:
             new = fixed_factor.solve(system.right_side(w * length, directions_world))
         else:
-            new = system.factor(w / length**2).solve(system.right_side(w / length, directions_world))
+            weights = w / np.maximum(length, shortest) ** 2
+            new = system.factor(weights).solve(system.right_side(weights * length, directions_world))
         new = centered(new)
         return np.asarray(new * (size / spread(new)))
 
@@ -118,6 +124,11 @@ class LaplacianSystem:
         pulled = weights[:, None] * directions
         i, j = self._edges[:, 0], self._edges[:, 1]
         return sum_at_nodes(self._num_images, j, pulled) - sum_at_nodes(self._num_images, i, pulled)
+
+
+def shortest_weighted_length(start: Array, edges: IntArray) -> float:
+    """Length below which edges weigh no more; the gauge keeps the scale, so that the start's edges tell it."""
+    return MIN_WEIGHTED_LENGTH * float(np.median(np.linalg.norm(start[edges[:, 1]] - start[edges[:, 0]], axis=1)))
 
 
 def edge_lengths(p: Array, edges: IntArray, size: float) -> Array:
