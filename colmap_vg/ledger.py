@@ -27,6 +27,8 @@ class Ledger:
     edge_verdicts : (m,) object array of EdgeVerdict
     image_verdicts : (n,) object array of ImageVerdict
     log : list of LogEntry
+    caveats : list of str
+        Sentences on what could not be had in full.
     """
 
     def __init__(self, graph: ViewGraph) -> None:
@@ -37,6 +39,7 @@ class Ledger:
         )
         self.image_verdicts: NDArray[np.object_] = np.full(graph.num_images, ImageVerdict.NO_EDGES, dtype=object)
         self.log: list[LogEntry] = []
+        self.caveats: list[str] = []
 
     @property
     def usable(self) -> BoolArray:
@@ -107,6 +110,7 @@ class Ledger:
             image_verdicts=self.image_verdicts.astype(str),
             status=status,
             message=message,
+            caveats=tuple(self.caveats),
             log=tuple(self.log),
         )
 

@@ -166,6 +166,8 @@ def _solve(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolu
         if not options.ba_refine_focal_length:
             solve = replace(solve, refine_focal_lengths="never")
         solution = solve_view_graph(graph, solve)
+        for caveat in solution.caveats:
+            log.warn(caveat)
         log.result(solution.message)
     return solution
 

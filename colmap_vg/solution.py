@@ -54,6 +54,8 @@ class PoseSolution:
     status : SolutionStatus
     message : str
         A sentence that says what happened and what to do.
+    caveats : tuple of str
+        Sentences on what could not be had in full.
     log : tuple of LogEntry
     """
 
@@ -68,4 +70,5 @@ class PoseSolution:
     image_verdicts: NDArray[np.str_]
     status: SolutionStatus
     message: str
+    caveats: tuple[str, ...] = ()
     log: tuple[LogEntry, ...] = field(default=())

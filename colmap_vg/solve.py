@@ -202,7 +202,13 @@ def _adjust_epipolar(ledger: Ledger, part: Subgraph, problem: EpipolarProblem, p
     found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     ledger.log.extend(found.log)
     ledger.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
-    focal_scales = found.focal_scales[focal_groups(ledger.graph)[0]]
+    group = focal_groups(ledger.graph)[0]
+    if found.lost_focals.any():
+        count = int(found.lost_focals[group].sum())
+        ledger.caveats.append(
+            f"The matches do not tell the focal length of {count} of {len(group)} cameras; it stays as it was read."
+        )
+    focal_scales = found.focal_scales[group]
     return _Poses(found.cam_from_world_rotations, found.projection_centers, focal_scales, found.converged)
 
 

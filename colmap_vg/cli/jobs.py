@@ -66,7 +66,7 @@ def solve(
 ) -> None:
     """The viewing graph only: a model of poses without points."""
     from colmap_vg.colmap_io.database import check_database
-    from colmap_vg.colmap_io.read import read_view_graph
+    from colmap_vg.colmap_io.read import read_with_caveats
     from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
     from colmap_vg.solve import solve_view_graph
 
@@ -75,10 +75,14 @@ def solve(
     check_database(database_path)
     refuse_models(output_path, overwrite)
     with log.stage("view graph"):
-        graph = read_view_graph(database_path, read)
+        graph, caveats = read_with_caveats(database_path, read)
+        for caveat in caveats:
+            log.warn(caveat)
         log.result(f"{len(graph.image_ids)} images, {len(graph.edges)} edges")
     with log.stage("solve"):
         solution = solve_view_graph(graph, options)
+        for caveat in solution.caveats:
+            log.warn(caveat)
         log.result(solution.message)
     if not solution.registered.any():
         raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")

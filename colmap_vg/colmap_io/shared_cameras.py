@@ -43,19 +43,21 @@ def merge_cameras(database_path: Path, groups: Sequence[Sequence[int]]) -> dict[
     replaced: dict[int, int] = {}
     with closing(sqlite3.connect(database_path)) as connection, connection:
         rows = connection.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
-        kind = {row[0]: row[1:] for row in rows}
+        # Databases of older schemas have no rigs, and pycolmap makes them when it loads one.
+        rig_of = dict(connection.execute("SELECT ref_sensor_id, rig_id FROM rigs").fetchall())
+        kind = {row[0]: (*row[1:], row[0] in rig_of) for row in rows}
         for ids in groups:
             firsts: dict[object, int] = {}
             for camera_id in sorted(ids):
                 first = firsts.setdefault(kind[camera_id], camera_id)
                 if first != camera_id:
                     replaced[camera_id] = first
-        rig_of = dict(connection.execute("SELECT ref_sensor_id, rig_id FROM rigs").fetchall())
         for old, new in replaced.items():
             connection.execute("UPDATE images SET camera_id = ? WHERE camera_id = ?", (new, old))
-            connection.execute("UPDATE frames SET rig_id = ? WHERE rig_id = ?", (rig_of[new], rig_of[old]))
             connection.execute("UPDATE frame_data SET sensor_id = ? WHERE sensor_id = ?", (new, old))
-            connection.execute("DELETE FROM rigs WHERE rig_id = ?", (rig_of[old],))
+            if old in rig_of:
+                connection.execute("UPDATE frames SET rig_id = ? WHERE rig_id = ?", (rig_of[new], rig_of[old]))
+                connection.execute("DELETE FROM rigs WHERE rig_id = ?", (rig_of[old],))
             connection.execute("DELETE FROM cameras WHERE camera_id = ?", (old,))
     return replaced
 

@@ -10,7 +10,7 @@ each edge's normal equations by its five or seven parameters are carried to its 
 The robust scale shrinks in steps, down to the noise of the matches. A step is taken only where it lowers the true cost.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ BoolArray = NDArray[np.bool_]
 _MAX_DAMPING = 1e6  # shares of the Hessian's diagonal
 _SHORTEST_BASELINE = 1e-6  # of the RMS distance of cameras; keeps the direction of coinciding cameras finite
 _MAX_LOG_FOCAL_STEP = 0.3
+_MAX_LOG_FOCAL = np.log(3.0)  # cameras with nearly no focal length see anything without an error
 _MIN_SIGMA_PX = 0.05  # pixels; no keypoints are better, and exact data keep a finite scale
 
 
@@ -46,20 +47,26 @@ class AdjustmentResult:
         Centroid 0, root mean square distance 1.
     focal_scales : (c,) array
         Factors on the focal lengths that the bearings were taken with; 1 for cameras that were not free.
+    lost_focals : (c,) bool array
+        Free focal lengths that the matches do not tell: they ran away, and were held as they came.
     reversed_edges : (m,) bool array
         Edges whose given direction turned out to point away from the solved one; dropped on the way.
     cost : float
         At the last scale, squared pixels.
     converged : bool
+    scale_px : float
+        The last Cauchy scale.
     log : tuple of LogEntry
     """
 
     cam_from_world_rotations: Array
     projection_centers: Array
     focal_scales: Array
+    lost_focals: BoolArray
     reversed_edges: BoolArray
     cost: float
     converged: bool
+    scale_px: float
     log: tuple[LogEntry, ...]
 
 
@@ -144,7 +151,27 @@ def adjust_epipolar(
     """
     if len(problem.bearings1) == 0:
         raise GraphError("epipolar adjustment: the edges have no matches")
-    cameras = Cameras(initial_rotations, gauged(initial_centers), np.zeros(len(problem.focal_lengths)))
+    lost = np.zeros(len(problem.focal_lengths), dtype=bool)
+    while True:
+        start = Cameras(initial_rotations, gauged(initial_centers), np.zeros(len(lost)))
+        held = replace(problem, free_focals=problem.free_focals & ~lost)
+        found = _in_stages(held, start, directions, scales_px, final_sigmas, max_num_iterations, tolerance)
+        ran_away = np.abs(np.log(found.focal_scales)) > _MAX_LOG_FOCAL
+        if not ran_away.any():
+            return replace(found, lost_focals=lost)
+        lost |= ran_away
+
+
+def _in_stages(
+    problem: EpipolarProblem,
+    cameras: Cameras,
+    directions: Array,
+    scales_px: tuple[float, ...],
+    final_sigmas: float,
+    max_num_iterations: int,
+    tolerance: float,
+) -> AdjustmentResult:
+    """One scale after the other; ends early where a focal length runs away."""
     reversed_edges, rows = np.zeros(len(problem.edges), dtype=bool), np.arange(len(problem.edges))
     log: list[LogEntry] = []
     scale, cost, converged = np.inf, np.inf, False
@@ -157,6 +184,8 @@ def adjust_epipolar(
             scale = min(scale, max(final_sigmas * _sigma(problem, cameras), _MIN_SIGMA_PX))
         end = tolerance if last else 100.0 * tolerance
         cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log)
+        if _ran_away(cameras):
+            break
         away = np.einsum("ka,ka->k", cameras.relative(problem.edges)[1], directions[rows]) < 0.0
         if away.any() and not away.all():
             reversed_edges[rows[away]] = True
@@ -167,9 +196,11 @@ def adjust_epipolar(
         so3.project(cameras.rotations),
         cameras.centers,
         np.exp(cameras.log_scales),
+        np.zeros(len(cameras.log_scales), dtype=bool),
         reversed_edges,
         cost,
         converged,
+        scale,
         tuple(log),
     )
 
@@ -179,6 +210,10 @@ def _sigma(problem: EpipolarProblem, cameras: Cameras) -> float:
     R, d, _ = cameras.relative(problem.edges)
     blocks = residuals_by_block(problem.matches(cameras.log_scales), R, d)
     return MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate([r for *_, r in blocks]))))
+
+
+def _ran_away(cameras: Cameras) -> bool:
+    return bool(np.any(np.abs(cameras.log_scales) > _MAX_LOG_FOCAL))
 
 
 def gauged(centers: Array) -> Array:
@@ -215,14 +250,14 @@ def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float) -> list[Cam
     at = normal_equations(
         problem.matches(cameras.log_scales), R, d, np.full(len(edges), scale), with_focals=with_focals
     )
-    chain = _chain(cameras.rotations[edges[:, 0]], R, d, length)
+    chain = edge_chain(cameras.rotations[edges[:, 0]], R, d, length)
     terms = [CameraTerms.chained(edges, at.costs, at.gradients, at.hessians, chain)]
     if problem.triplets is not None:
         images = problem.triplets.images
         rays = problem.triplet_rays(problem.triplets, cameras.log_scales)
         poses = cameras.about_middle(images)
         depth = depth_equations(rays, poses, scale, with_focals=with_focals)
-        chain = _triplet_chain(cameras.rotations[images[:, 1]], poses)
+        chain = triplet_chain(cameras.rotations[images[:, 1]], poses)
         terms.append(CameraTerms.chained(images, depth.costs, depth.gradients, depth.hessians, chain))
     return terms
 
@@ -236,7 +271,7 @@ def _cost(problem: EpipolarProblem, cameras: Cameras, scale: float) -> float:
     return float(cost)
 
 
-def _chain(R_i: Array, R: Array, d: Array, length: Array) -> Array:
+def edge_chain(R_i: Array, R: Array, d: Array, length: Array) -> Array:
     """Derivatives (m, 5, 12) of an edge's five parameters by its cameras' ``(w_i, x_i, w_j, x_j)``."""
     Q1, Q2 = frames(R, d)
     B = np.swapaxes(Q1[:, :, :2], 1, 2)
@@ -250,7 +285,7 @@ def _chain(R_i: Array, R: Array, d: Array, length: Array) -> Array:
     return chain
 
 
-def _triplet_chain(R_b: Array, poses: TripletPoses) -> Array:
+def triplet_chain(R_b: Array, poses: TripletPoses) -> Array:
     """Derivatives (q, 12, 18) of a triplet's parameters by its cameras' ``(w, x)``, in the order a, b, c."""
     chain = np.zeros((len(R_b), 12, 18))
     for side, first in ((0, 0), (1, 12)):
@@ -289,5 +324,7 @@ def _minimized(
         log.append(LogEntry("epipolar", iteration + 1, cost, change))
         if change < end:
             return cameras, cost, True
+        if _ran_away(cameras):
+            break
         terms = _terms(problem, cameras, scale)
     return cameras, before, False

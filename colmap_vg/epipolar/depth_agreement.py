@@ -109,6 +109,32 @@ def depth_equations(
 
 
 @dataclass(frozen=True, eq=False)
+class DepthDerivatives:
+    """Residuals (k,) in pixels, with derivatives by the poses and log focals (b, k) and by the keypoints.
+
+    `by_rays` (3, 3, k): of images a, b, c, tangent to the rays in the frames of their cameras, per pixel of the
+    keypoint's noise (its pull on s left out); the squared norms sum to one.
+    """
+
+    r: Array
+    by_pose: Array
+    by_rays: Array
+
+
+def depth_derivatives_by_block(
+    rays: TripletRays, poses: TripletPoses, *, with_focals: bool = False
+) -> Iterator[tuple[slice, slice, IntArray, DepthDerivatives]]:
+    """Runs of whole triplets: their slice, their rows' slice, offsets from the first row, and derivatives."""
+    for triplets, rows, offsets in _blocks(rays.offsets):
+        at = _evaluate(rays, poses, triplets, rows, offsets)
+        v = rays.variances[:, triplets][:, segment_of_rows(offsets)]
+        by_rays = np.stack(at.along) / np.sqrt(v * at.variance)[:, None]
+        for image in (0, 2):
+            by_rays[image] = np.einsum("bak,bk->ak", at.turns[image // 2], by_rays[image])
+        yield triplets, rows, offsets, DepthDerivatives(at.r, _jacobian(at, with_focals), by_rays)
+
+
+@dataclass(frozen=True, eq=False)
 class _Side:
     """Inverse depth in b by one other image, and its derivatives by the rays and the baseline; (3, k) arrays."""
 

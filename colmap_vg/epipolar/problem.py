@@ -37,6 +37,8 @@ class EpipolarProblem:
     free_focals : (c,) bool array
     triplets : Triplets or None
         Tracks that three images share; they tell the ratios of baselines.
+    keypoints1, keypoints2 : (k,) int array or None
+        Keypoints of the matches in image 1 and image 2.
     """
 
     num_images: int
@@ -48,6 +50,8 @@ class EpipolarProblem:
     focal_lengths: Array
     free_focals: BoolArray
     triplets: Triplets | None = None
+    keypoints1: NDArray[np.int32] | None = None
+    keypoints2: NDArray[np.int32] | None = None
 
     def matches(self, log_scales: Array) -> Matches:
         """Bearings and pixel variances at logarithms (c,) of factors on the focal lengths."""
@@ -66,6 +70,7 @@ class EpipolarProblem:
         """The same without some edges."""
         matches = Matches(self.offsets, self.bearings1, self.bearings2, *np.zeros((2, len(self.edges))))
         kept = matches.of(np.flatnonzero(~dropped))
+        rows = np.repeat(~dropped, np.diff(self.offsets))
         triplets = None if self.triplets is None else self.triplets.without(dropped)
         return replace(
             self,
@@ -74,6 +79,8 @@ class EpipolarProblem:
             bearings1=kept.bearings1,
             bearings2=kept.bearings2,
             triplets=None if triplets is None or len(triplets.images) == 0 else triplets,
+            keypoints1=None if self.keypoints1 is None else self.keypoints1[rows],
+            keypoints2=None if self.keypoints2 is None else self.keypoints2[rows],
         )
 
     def triplet_rays(self, triplets: Triplets, log_scales: Array) -> TripletRays:
@@ -141,6 +148,8 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
         focals,
         np.asarray(free),
         triplets if triplets is not None and len(triplets.images) else None,
+        None if graph.inlier_keypoints1 is None else graph.inlier_keypoints1[rows],
+        None if graph.inlier_keypoints2 is None else graph.inlier_keypoints2[rows],
     )
 
 

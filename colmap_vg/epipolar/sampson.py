@@ -65,6 +65,20 @@ class NormalEquations:
     hessians: Array
 
 
+@dataclass(frozen=True, eq=False)
+class SampsonDerivatives:
+    """Residuals (k,) in pixels, with derivatives by (w, tau) and the log focals (b, k), and by the keypoints.
+
+    `by_ray1` and `by_ray2` (3, k) are tangent to the rays, in the frames of their cameras, per pixel of the keypoint's
+    noise; the noise's pull on s is left out, being of second order. Their squared norms sum to one.
+    """
+
+    r: Array
+    by_pose: Array
+    by_ray1: Array
+    by_ray2: Array
+
+
 def frames(R: Array, d: Array) -> tuple[Array, Array]:
     """``Q = [B, d]`` in camera 1's frame and the same axes ``R Q`` in camera 2's: (m, 3, 3) each."""
     Q = np.concatenate([tangent_basis(d), d[:, :, None]], axis=2)
@@ -122,6 +136,22 @@ def residuals_by_block(matches: Matches, R: Array, d: Array) -> Iterator[tuple[s
     """Runs of whole edges: their slice, their rows' slice, offsets from the first row, residuals in pixels."""
     for edges, rows, offsets in _blocks(matches):
         yield edges, rows, offsets, _at_frames(matches, R, d, edges, rows, offsets).r
+
+
+def derivatives_by_block(
+    matches: Matches, R: Array, d: Array, *, with_focals: bool = False
+) -> Iterator[tuple[slice, slice, IntArray, "SampsonDerivatives"]]:
+    """Runs of whole edges as `residuals_by_block`, with the residuals' derivatives by poses and by keypoints."""
+    for edges, rows, offsets in _blocks(matches):
+        at = _at_frames(matches, R, d, edges, rows, offsets)
+        edge = segment_of_rows(offsets)
+        Q1, Q2 = frames(R[edges], d[edges])
+        rays = []
+        sides = ((Q1, -at.z[1], at.z[0], matches.bearings1, at.v1), (Q2, at.y[1], -at.y[0], matches.bearings2, at.v2))
+        for Q, first, second, bearings, v in sides:
+            line = np.stack([Q[:, a, 0][edge] * first + Q[:, a, 1][edge] * second for a in range(3)])
+            rays.append((line - at.c * bearings[rows].T) * np.sqrt(v / at.variance))
+        yield edges, rows, offsets, SampsonDerivatives(at.r, _jacobian(at, with_focals), rays[0], rays[1])
 
 
 def segment_totals(offsets: IntArray, values: Array) -> Array:

@@ -39,12 +39,15 @@ class Triplets:
         Tracks of triplet k are rows ``offsets[k]:offsets[k + 1]``.
     bearings : (3, 3, k) array
         Unit rays in a, b and c; components second.
+    keypoints : (3, k) int64 array
+        Keypoints in a, b and c.
     """
 
     images: IntArray
     edges: IntArray
     offsets: IntArray
     bearings: Array
+    keypoints: IntArray
 
     def without(self, dropped: BoolArray) -> "Triplets":
         """The same without those that use a dropped edge (m,), the edges left numbered anew."""
@@ -57,6 +60,7 @@ class Triplets:
             edges=number[self.edges[kept]],
             offsets=offsets,
             bearings=self.bearings[:, :, rows],
+            keypoints=self.keypoints[:, rows],
         )
 
 
@@ -99,12 +103,14 @@ def find_triplets(
     shared = np.concatenate([[0], np.cumsum(np.bincount(first[0], minlength=len(pairs)))]).astype(np.int64)
     kept = evenly_thinned(shared, TRACKS_PER_TRIPLET)
     of_other, of_middle = np.concatenate([bearings2, bearings1]), np.concatenate([bearings1, bearings2])
+    in_other = np.concatenate([keypoints2, keypoints1]).astype(np.int64)
     rows_a, rows_c = first[1][kept], second[kept]
     return Triplets(
         np.stack([other[pairs[:, 0]], middle[pairs[:, 0]], other[pairs[:, 1]]], axis=1),
         pairs % m,
         segment_subset(shared, kept),
         np.stack([of_other[rows_a].T, of_middle[rows_a].T, of_other[rows_c].T]),
+        np.stack([in_other[rows_a], keypoints[rows_a], in_other[rows_c]]),
     )
 
 

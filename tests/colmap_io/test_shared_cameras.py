@@ -84,3 +84,12 @@ def test_only_alike_cameras_are_merged(tmp_path: Path) -> None:
     with pycolmap.Database.open(tmp_path / "true.db") as database:
         assert sorted(camera.camera_id for camera in database.read_all_cameras()) == [ids[0], ids[2]]
         assert len(database.read_all_frames()) == 4
+
+
+def test_databases_from_before_rigs_share_cameras_too(tmp_path: Path) -> None:
+    truth = make_database(tmp_path / "true.db", noise_px=0.5, camera=RADIAL, camera_per_image=True, num_points=400)
+    tables = [f"DELETE FROM {table}" for table in ("rigs", "rig_sensors", "frames", "frame_data")]
+    path = changed_copy(without_focals(tmp_path / "true.db"), tmp_path / "old.db", *tables)
+    model = view_graph_mapping(path, None, tmp_path / "out")[0]
+    assert sorted(model.cameras) == sorted(truth.cameras)
+    np.testing.assert_allclose([camera.mean_focal_length() for camera in model.cameras.values()], 1280.0, rtol=0.01)

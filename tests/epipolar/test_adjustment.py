@@ -283,3 +283,15 @@ def test_last_scale_follows_the_noise_of_the_matches():
         align_positions(followed.projection_centers, p)[0].mean()
         < 0.5 * align_positions(fixed.projection_centers, p)[0].mean()
     )
+
+
+def test_focal_lengths_that_the_matches_do_not_tell_are_held():
+    problem, R, p = scene(4, sigma_px=0.3, free=True)
+    rng = np.random.default_rng(3)
+    anywhere = np.ones_like(problem.bearings1)
+    anywhere[:, :2] = 0.3 * rng.standard_normal((len(anywhere), 2))
+    noise = normalized(anywhere)
+    found = adjust_epipolar(replace(problem, bearings1=noise), R, p, directions_of(problem, R, p))
+    assert found.lost_focals.all()
+    np.testing.assert_array_equal(found.focal_scales, 1.0)
+    assert not adjust_epipolar(problem, R, p, directions_of(problem, R, p)).lost_focals.any()
