@@ -1,7 +1,5 @@
 """The book kept while a graph is solved: verdicts on images and edges, and the iteration log."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +38,11 @@ class Ledger:
         self.image_verdicts: NDArray[np.object_] = np.full(graph.num_images, ImageVerdict.NO_EDGES, dtype=object)
         self.log: list[LogEntry] = []
         self.caveats: list[str] = []
+        self._R, self._p = np.full((graph.num_images, 3, 3), np.nan), np.full((graph.num_images, 3), np.nan)
+        self._component = np.full(graph.num_images, -1, dtype=np.int64)
+        self._focal_scales = np.ones(num_cameras(graph))
+        self._seen_cameras = np.zeros(num_cameras(graph), dtype=bool)
+        self._converged = True
 
     @property
     def usable(self) -> BoolArray:
@@ -54,14 +57,20 @@ class Ledger:
         """Take dropped edges back."""
         self.edge_verdicts[edge_rows] = EdgeVerdict.KEPT
 
+    def leave_out(self, part: Subgraph, verdict: ImageVerdict) -> None:
+        """Leave out the images of a part for a reason, but for those that have one."""
+        in_question = self.image_verdicts[part.images] == ImageVerdict.REGISTERED
+        self.image_verdicts[part.images[in_question]] = verdict
+
     def largest_component(self, images: BoolArray, otherwise: ImageVerdict) -> Subgraph:
         """Largest connected component among the images marked; the others of them that had edges get the verdict."""
         edges = self.usable & images[self.graph.edges].all(axis=1)
         linked = np.zeros(self.graph.num_images, dtype=bool)
         linked[self.graph.edges[edges].ravel()] = True
         inside = linked & (components_by_size(self.graph.num_images, self.graph.edges[edges]) == 0)
-        had_edges = linked | (self.image_verdicts == ImageVerdict.REGISTERED)
-        self.image_verdicts[images & had_edges & ~inside] = otherwise
+        in_question = self.image_verdicts == ImageVerdict.REGISTERED
+        in_question |= linked & (self.image_verdicts == ImageVerdict.NO_EDGES)
+        self.image_verdicts[images & in_question & ~inside] = otherwise
         self.image_verdicts[inside] = ImageVerdict.REGISTERED
         return Subgraph.of(self.graph.edges, inside, edges)
 
@@ -76,35 +85,41 @@ class Ledger:
         kept[part.edge_rows[directed][edges]] = True
         return Subgraph.of(self.graph.edges, inside, kept)
 
-    def unsolvable(self, message: str) -> PoseSolution:
-        """A solution without a registered image."""
-        self.image_verdicts[self.image_verdicts == ImageVerdict.REGISTERED] = ImageVerdict.NOT_RIGID
-        nobody = np.zeros(self.graph.num_images, dtype=bool)
-        part = Subgraph.of(self.graph.edges, nobody, np.zeros(self.graph.num_edges, dtype=bool))
-        solution = self.solution(part, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.ones(num_cameras(self.graph)), True)
-        return replace(solution, status=SolutionStatus.UNSOLVABLE, message=message)
+    def place(self, part: Subgraph, rotations: Array, centers: Array, focal_scales: Array, converged: bool) -> None:
+        """Take down the poses of a part as a component of its own; centroid 0, root mean square distance 1."""
+        moved = centers - centers.mean(axis=0)
+        self._R[part.images] = so3.project(rotations)
+        self._p[part.images] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+        self._component[part.images] = self._component.max() + 1
+        self._converged &= converged
+        if self.graph.camera_idx is not None:
+            # A camera of two components keeps what the larger one found.
+            cameras = np.zeros(len(focal_scales), dtype=bool)
+            cameras[self.graph.camera_idx[part.images]] = True
+            own = cameras & ~self._seen_cameras
+            self._focal_scales[own] = focal_scales[own]
+            self._seen_cameras |= cameras
 
-    def solution(
-        self, part: Subgraph, rotations: Array, centers: Array, focal_scales: Array, converged: bool
-    ) -> PoseSolution:
-        """Poses of a part in the graph's order, with centroid 0 and root mean square distance 1."""
-        n = self.graph.num_images
-        registered = np.zeros(n, dtype=bool)
-        registered[part.images] = True
-        R, p = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
-        R[part.images] = so3.project(rotations)
-        if part.num_images:
-            moved = centers - centers.mean(axis=0)
-            p[part.images] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
-        self.drop(np.flatnonzero(self.usable & ~registered[self.graph.edges].all(axis=1)), EdgeVerdict.OUTSIDE)
-        status, message = described(self.image_verdicts, converged)
+    def solution(self) -> PoseSolution:
+        """What was placed, in the graph's order; unsolvable when nothing was."""
+        component = self._component
+        if component.max() >= 0:
+            sizes = np.bincount(component[component >= 0])
+            rank = np.empty(len(sizes), dtype=np.int64)
+            rank[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
+            component = np.where(component >= 0, rank[component], -1)
+        self.image_verdicts[component == 0] = ImageVerdict.REGISTERED
+        self.image_verdicts[component > 0] = ImageVerdict.OTHER_MODEL
+        ends = component[self.graph.edges]
+        self.drop(np.flatnonzero(self.usable & ((ends[:, 0] < 0) | (ends[:, 0] != ends[:, 1]))), EdgeVerdict.OUTSIDE)
+        status, message = described(self.image_verdicts, self._converged)
         return PoseSolution(
             image_ids=self.graph.image_ids,
-            cam_from_world_rotations=R,
-            projection_centers=p,
-            registered=registered,
-            component=np.where(registered, 0, -1),
-            focal_scales=focal_scales,
+            cam_from_world_rotations=self._R,
+            projection_centers=self._p,
+            registered=component == 0,
+            component=component,
+            focal_scales=self._focal_scales,
             edge_kept=self.usable,
             edge_verdicts=self.edge_verdicts.astype(str),
             image_verdicts=self.image_verdicts.astype(str),
@@ -116,16 +131,19 @@ class Ledger:
 
 
 def described(image_verdicts: NDArray[np.generic], converged: bool) -> tuple[SolutionStatus, str]:
-    """Status of a solution with some image registered, and the sentence that tells it."""
+    """Status of a solution, and the sentence that tells it."""
     words, counts = np.unique(image_verdicts.astype(str), return_counts=True)
-    left_out = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
-    status, message = SolutionStatus.SOLVED, f"All {len(image_verdicts)} images are registered."
-    if left_out:
-        reasons = ", ".join(f"{count} {word}" for word, count in left_out.items())
-        status, message = (
-            SolutionStatus.PARTIAL,
-            f"{sum(left_out.values())} of {len(image_verdicts)} images are left out",
+    elsewhere = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
+    if sum(elsewhere.values()) == len(image_verdicts):
+        return SolutionStatus.UNSOLVABLE, (
+            "No three images are linked by directions that fix their positions: "
+            "add overlapping photographs, taken from different places."
         )
+    status, message = SolutionStatus.SOLVED, f"All {len(image_verdicts)} images are registered."
+    if elsewhere:
+        reasons = ", ".join(f"{count} {word}" for word, count in elsewhere.items())
+        status = SolutionStatus.PARTIAL
+        message = f"{sum(elsewhere.values())} of {len(image_verdicts)} images are left out of the largest model"
         message += f" ({reasons}); see image_verdicts."
     if not converged:
         status = SolutionStatus.NOT_CONVERGED

@@ -1,6 +1,6 @@
 """From a COLMAP database to models: read the viewing graph, solve it, build the model, write it whole or not at all."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -123,31 +123,67 @@ def map_database(
         solution = _solve(graph, options, log)
         if not solution.registered.any():
             raise MappingError(f"{database_path}: {solution.message}")
-        shared = shared_cameras(graph) if options.share_cameras else []
-        with log.stage("load"):
-            with loaded_cache(database_path, work, options.read.min_num_inliers, shared) as (cache, replaced):
-                reconstruction = reconstruction_from_solution(cache, solution, graph)
-            if replaced:
-                log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
-        result = build_model(cache, reconstruction, options, log)
-        if reconstruction.num_reg_images() < 2 or reconstruction.num_points3D() == 0:
+        built = _build(database_path, work, graph, solution, options, log)
+        if not built:
             raise MappingError(
-                f"{database_path}: {int(solution.registered.sum())} poses were solved, but no three images share points"
-                " at an angle that could fix them; add overlapping photographs, taken from different places"
+                f"{database_path}: {int((solution.component >= 0).sum())} poses were solved, but no three images share"
+                " points at an angle that could fix them; add overlapping photographs, taken from different places"
             )
-        if replaced:
-            with log.stage("cameras"), loaded_cache(database_path, work, options.read.min_num_inliers) as (cache, _):
-                reconstruction = _on_own_cameras(cache, reconstruction, replaced, options, log)
         with log.stage("write"):
-            reconstruction.normalize()
-            if options.extract_colors:
-                extract_colors(reconstruction, image_path, log)
-            staged = work / "0"
-            staged.mkdir(exist_ok=True)
-            reconstruction.write(staged)
-            publish_models([staged], output_path)
-            log.result(str(Path(output_path) / "0"))
-    return MappingResult({0: reconstruction}, graph, _as_in_model(solution, graph, reconstruction, result))
+            staged = [work / str(index) for index in range(len(built))]
+            for folder, model in zip(staged, built, strict=True):
+                model.reconstruction.normalize()
+                if options.extract_colors:
+                    extract_colors(model.reconstruction, image_path, log)
+                folder.mkdir(exist_ok=True)
+                model.reconstruction.write(folder)
+            published = publish_models(staged, output_path)
+            log.result(", ".join(map(str, published)))
+    models = {index: model.reconstruction for index, model in enumerate(built)}
+    return MappingResult(models, graph, _as_in_models(solution, graph, built))
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A finished model, the component of the solution it comes from, and what changed on the way."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    component: int
+    result: BuildResult
+
+
+def _build(
+    database_path: str | PathLike[str],
+    work: Path,
+    graph: ViewGraph,
+    solution: PoseSolution,
+    options: MappingOptions,
+    log: StageLog,
+) -> list[_Model]:
+    """Models of all components that the points support, the one with most images first."""
+    shared = shared_cameras(graph) if options.share_cameras else []
+    with log.stage("load"):
+        with loaded_cache(database_path, work, options.read.min_num_inliers, shared) as (cache, replaced):
+            components = range(int(solution.component.max()) + 1)
+            posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
+        if replaced:
+            log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
+    models = []
+    for component, reconstruction in enumerate(posed):
+        others = frozenset(solution.image_ids[~np.isin(solution.component, (-1, component))].tolist())
+        result = build_model(cache, reconstruction, options, log, others)
+        if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() > 0:
+            models.append(_Model(reconstruction, component, result))
+        elif len(posed) > 1:
+            count = int((solution.component == component).sum())
+            log.warn(f"{count} images that seemed a model of their own share no points that could fix them.")
+    if models and replaced:
+        with log.stage("cameras"), loaded_cache(database_path, work, options.read.min_num_inliers) as (cache, _):
+            models = [
+                replace(m, reconstruction=_on_own_cameras(cache, m.reconstruction, replaced, options, log))
+                for m in models
+            ]
+    return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
 
 
 def _read(database_path: str | PathLike[str], options: MappingOptions, log: StageLog) -> ViewGraph:
@@ -192,39 +228,45 @@ def _on_own_cameras(
     return with_own_cameras(cache, shared, replaced)
 
 
-def _as_in_model(
-    solution: PoseSolution, graph: ViewGraph, model: "pycolmap.Reconstruction", result: BuildResult
-) -> PoseSolution:
-    """The solution with the poses, focal lengths and image verdicts of the finished model."""
+def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Model]) -> PoseSolution:
+    """The solution with the poses, focal lengths and image verdicts of the finished models."""
     words = solution.image_verdicts.astype(object)
-    words[np.isin(solution.image_ids, sorted(result.added))] = ImageVerdict.REGISTERED
-    words[np.isin(solution.image_ids, sorted(result.removed))] = ImageVerdict.FEW_OBSERVATIONS
-    registered = words == ImageVerdict.REGISTERED
+    words[solution.component >= 0] = ImageVerdict.FEW_OBSERVATIONS
+    component = np.full(len(words), -1)
     rotations = np.full_like(solution.cam_from_world_rotations, np.nan)
     centers = np.full_like(solution.projection_centers, np.nan)
-    for row in np.flatnonzero(registered):
-        image = model.image(int(solution.image_ids[row]))
-        rotations[row] = image.cam_from_world().rotation.matrix()
-        centers[row] = image.projection_center()
+    focal_scales = solution.focal_scales.copy()
+    for index in reversed(range(len(models))):
+        model = models[index].reconstruction
+        for row in np.flatnonzero(np.isin(solution.image_ids, sorted(model.reg_image_ids()))):
+            image = model.image(int(solution.image_ids[row]))
+            component[row] = index
+            words[row] = ImageVerdict.REGISTERED if index == 0 else ImageVerdict.OTHER_MODEL
+            rotations[row] = image.cam_from_world().rotation.matrix()
+            centers[row] = image.projection_center()
+        focal_scales = _focal_scales(focal_scales, graph, model)
     status, message = described(words, solution.status != SolutionStatus.NOT_CONVERGED)
     return replace(
         solution,
         cam_from_world_rotations=rotations,
         projection_centers=centers,
-        registered=registered,
-        component=np.where(registered, 0, -1),
-        focal_scales=_focal_scales(solution, graph, model),
+        registered=component == 0,
+        component=component,
+        focal_scales=focal_scales,
         image_verdicts=words.astype(str),
         status=status,
         message=message,
     )
 
 
-def _focal_scales(solution: PoseSolution, graph: ViewGraph, model: "pycolmap.Reconstruction") -> NDArray[np.float64]:
+def _focal_scales(
+    scales: NDArray[np.float64], graph: ViewGraph, model: "pycolmap.Reconstruction"
+) -> NDArray[np.float64]:
     """Factors from the graph's focal lengths to the model's; cameras that are not in the model keep theirs."""
-    scales = solution.focal_scales.copy()
+    scales = scales.copy()
     if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
+        used = {model.image(i).camera_id for i in model.reg_image_ids()}
         for row, camera_id in enumerate(graph.camera_ids.tolist()):
-            if model.exists_camera(camera_id):
+            if camera_id in used:
                 scales[row] = model.camera(camera_id).mean_focal_length() / graph.camera_focal_lengths[row]
     return scales

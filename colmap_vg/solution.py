@@ -33,15 +33,18 @@ class LogEntry:
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """Poses of all images of a graph, in the graph's order; rows of unregistered images hold NaN.
+    """Poses of all images of a graph, in the graph's order; rows of unsolved images hold NaN.
+
+    Images that nothing links firmly are solved in several components, each in a frame of its own.
 
     Attributes
     ----------
     image_ids : (n,) int64 array
     cam_from_world_rotations : (n, 3, 3) array
     projection_centers : (n, 3) array
-        Camera centres in the world frame; centroid 0, root mean square distance 1 over the registered images.
+        Camera centres in the component's frame; centroid 0, root mean square distance 1 over its images.
     registered : (n,) bool array
+        Images of component 0, the largest: those that share a frame with most others.
     component : (n,) int64 array
         Component each image belongs to, numbered by size; -1 where unsolved.
     focal_scales : (c,) array

@@ -36,6 +36,8 @@ from colmap_vg.view_graph import ViewGraph
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+MIN_COMPONENT_IMAGES = 3
+"""Two images have no more than a direction between them."""
 ROUGH_ITERATIONS = 20
 """Outer iterations of Alg. 2 before the epipolar adjustment, at most."""
 TRIAL_SHARE = 0.25
@@ -52,7 +54,7 @@ _BASELINES = {
 
 
 def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> PoseSolution:
-    """Solve all rotations and positions of a viewing graph's largest parallel-rigid part.
+    """Solve all rotations and positions of a viewing graph's parallel-rigid parts of three images or more.
 
     Parameters
     ----------
@@ -62,23 +64,29 @@ def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> P
     Returns
     -------
     PoseSolution
-        In the graph's order of images and edges. An unsolvable graph gives a solution with no registered image,
-        status ``unsolvable`` and the reason in its message.
+        In the graph's order of images and edges, the largest part as component 0. An unsolvable graph gives a
+        solution with no registered image, status ``unsolvable`` and the reason in its message.
     """
     options = options or SolveOptions()
     ledger = Ledger(graph)
-    part = ledger.largest_component(np.ones(graph.num_images, dtype=bool), ImageVerdict.SMALLER_COMPONENT)
-    rotations, part = _average_rotations(ledger, part, options)
-    part = _admit_trials(ledger, part, rotations, options)
-    rigid = _filter_directions(ledger, part, rotations, options)
-    if rigid.num_images < 3:
-        return ledger.unsolvable(
-            "No three images are linked by directions that fix their positions: "
-            "add overlapping photographs, taken from different places."
-        )
-    poses = _Poses(rotations[part.rows_of(rigid.images)], np.zeros((rigid.num_images, 3)), np.ones(num_cameras(graph)))
-    poses = _solve_poses(ledger, rigid, poses, options)
-    return ledger.solution(rigid, poses.rotations, poses.centers, poses.focal_scales, poses.converged)
+    unsolved = np.ones(graph.num_images, dtype=bool)
+    while True:
+        part = ledger.largest_component(unsolved, ImageVerdict.SMALLER_COMPONENT)
+        if part.num_images < MIN_COMPONENT_IMAGES:
+            ledger.leave_out(part, ImageVerdict.SMALLER_COMPONENT)
+            return ledger.solution()
+        rotations, gated = _average_rotations(ledger, part, options)
+        gated = _admit_trials(ledger, gated, rotations, options)
+        rigid = _filter_directions(ledger, gated, rotations, options)
+        if rigid.num_images < MIN_COMPONENT_IMAGES:
+            ledger.leave_out(gated, ImageVerdict.NOT_RIGID)
+            unsolved[gated.images] = False
+            continue
+        own = rotations[gated.rows_of(rigid.images)]
+        poses = _Poses(own, np.zeros((rigid.num_images, 3)), np.ones(num_cameras(graph)))
+        poses = _solve_poses(ledger, rigid, poses, options)
+        ledger.place(rigid, poses.rotations, poses.centers, poses.focal_scales, poses.converged)
+        unsolved[rigid.images] = False
 
 
 @dataclass(frozen=True, eq=False)

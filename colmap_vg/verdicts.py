@@ -27,17 +27,20 @@ class EdgeVerdict(StrEnum):
     REVERSED = "reversed"
     """Its direction points away from the solved one."""
     OUTSIDE = "outside_component"
-    """It lies outside the component that was solved."""
+    """It lies outside what was solved, or links two models."""
 
 
 class ImageVerdict(StrEnum):
     """Why an image was registered or left out."""
 
     REGISTERED = "registered"
+    """It is in the largest model."""
+    OTHER_MODEL = "other_model"
+    """It is in a smaller model of its own frame; nothing that holds links the two."""
     NO_EDGES = "no_edges"
     """No verified pair of this image could be used."""
     SMALLER_COMPONENT = "smaller_component"
-    """It is connected only to images outside the largest component."""
+    """It is connected only to images outside the largest component, too few for a model of their own."""
     CUT_OFF = "cut_off"
     """All edges that linked it to the solved images were outliers."""
     NOT_RIGID = "not_rigid"
@@ -51,7 +54,7 @@ class SolutionStatus(StrEnum):
 
     SOLVED = "solved"
     PARTIAL = "partial"
-    """Solved, but some images were left out."""
+    """Solved, but some images are not in the largest model."""
     NOT_CONVERGED = "not_converged"
     """The iteration limit was reached; the poses are the best found."""
     UNSOLVABLE = "unsolvable"

@@ -213,7 +213,7 @@ def test_no_tracks_of_three_views_is_a_clear_error(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_of_two_components_the_larger_is_made(noisy: tuple[Path, pycolmap.Reconstruction], tmp_path: Path) -> None:
+def test_two_components_become_two_models(noisy: tuple[Path, pycolmap.Reconstruction], tmp_path: Path) -> None:
     path, truth = noisy
     small = (2, 5, 9)
     cut = [pair_id(*sorted((a, b))) for a in small for b in range(1, 11) if b not in small]
@@ -221,13 +221,22 @@ def test_of_two_components_the_larger_is_made(noisy: tuple[Path, pycolmap.Recons
     path = changed_copy(path, tmp_path / "a.db", f"DELETE FROM two_view_geometries WHERE pair_id IN ({rows})")
     result, _ = job(path, tmp_path / "out")
     large = [i for i in range(1, 11) if i not in small]
-    assert sorted(result.models[0].reg_image_ids()) == large
+    assert {index: sorted(model.reg_image_ids()) for index, model in result.models.items()} == {
+        0: large,
+        1: list(small),
+    }
     words = dict(zip(result.solution.image_ids.tolist(), result.solution.image_verdicts.tolist(), strict=True))
-    assert {words[i] for i in small} == {ImageVerdict.SMALLER_COMPONENT}
+    assert {words[i] for i in small} == {ImageVerdict.OTHER_MODEL}
     assert {words[i] for i in large} == {ImageVerdict.REGISTERED}
     assert result.solution.status == SolutionStatus.PARTIAL
-    errors, _ = align_positions(centers(result.models[0], large), centers(truth, large))
-    assert errors.max() < 0.05
+    assert result.solution.component.tolist() == [1 if i in small else 0 for i in result.solution.image_ids]
+    for index, ids in ((0, large), (1, list(small))):
+        written = pycolmap.Reconstruction(tmp_path / "out" / str(index))
+        assert sorted(written.reg_image_ids()) == ids
+        errors, _ = align_positions(centers(written, ids), centers(truth, ids))
+        assert errors.max() < 0.05
+        rows = np.searchsorted(result.solution.image_ids, ids)
+        np.testing.assert_allclose(result.solution.projection_centers[rows], centers(written, ids))
 
 
 def test_two_images_are_too_few(tmp_path: Path) -> None:

@@ -112,6 +112,31 @@ def test_graphs_that_fix_nothing_are_unsolvable_and_say_so(edges):
     assert "overlapping" in solution.message
 
 
+def test_parts_that_nothing_links_are_components_of_their_own():
+    # Two rings that share an image hinge on it; a third one has one false link to the first.
+    scenes = [ring_scene(12, 4, seed=1), ring_scene(8, 4, seed=2), ring_scene(6, 4, seed=3)]
+    starts = np.cumsum([0, 11, 8])
+    edges = np.concatenate([scene.graph.edges + start for scene, start in zip(scenes, starts, strict=True)])
+    false_link = np.array([[3, starts[2] + 1]])
+    graph = ViewGraph(
+        np.arange(starts[2] + 6),
+        np.concatenate([edges, false_link]),
+        np.concatenate([*(s.graph.cam2_from_cam1_rotations for s in scenes), so3.exp(np.array([[2.0, 1.0, 0.5]]))]),
+        np.concatenate([*(s.graph.cam2_in_cam1_directions for s in scenes), [[0.0, 0.0, 1.0]]]),
+    )
+    solution = solve_view_graph(graph, SolveOptions(method="1O"))
+    assert solution.component.tolist() == [0] * 12 + [1] * 7 + [2] * 6
+    assert solution.registered.tolist() == [True] * 12 + [False] * 13
+    assert solution.image_verdicts.tolist() == [ImageVerdict.REGISTERED] * 12 + [ImageVerdict.OTHER_MODEL] * 13
+    assert solution.status == SolutionStatus.PARTIAL
+    assert not solution.edge_kept[-1]
+    for index, (scene, start) in enumerate(zip(scenes, starts, strict=True)):
+        rows = np.flatnonzero(solution.component == index)
+        errors, _ = align_positions(solution.projection_centers[rows], scene.projection_centers[rows - start])
+        assert errors.max() < 1e-6
+        assert np.mean(np.sum(solution.projection_centers[rows] ** 2, axis=1)) == pytest.approx(1.0)
+
+
 def test_edges_refused_on_reading_are_not_used():
     scene = ring_scene(20, 6)
     words = np.full(scene.graph.num_edges, EdgeVerdict.KEPT, dtype=object)

@@ -64,9 +64,9 @@ def loaded_cache(
 
 
 def reconstruction_from_solution(
-    cache: "pycolmap.DatabaseCache", solution: PoseSolution, graph: ViewGraph
+    cache: "pycolmap.DatabaseCache", solution: PoseSolution, graph: ViewGraph, component: int = 0
 ) -> "pycolmap.Reconstruction":
-    """Reconstruction of the solved poses, without points.
+    """Reconstruction of one component's poses, without points.
 
     Parameters
     ----------
@@ -75,11 +75,12 @@ def reconstruction_from_solution(
     solution : PoseSolution
         Its focal factors go on top of the graph's focal lengths.
     graph : ViewGraph
+    component : int
 
     Returns
     -------
     pycolmap.Reconstruction
-        All images of the database; those registered in the solution have poses.
+        All images of the database; those of the component have poses.
     """
     reconstruction = pycolmap.Reconstruction()
     reconstruction.load(cache)
@@ -93,7 +94,7 @@ def reconstruction_from_solution(
                 # Not touched where nothing changed, so that given calibrations stay as they are to the last bit.
                 if abs(factor - 1.0) > 1e-12:
                     camera.params = with_focal_scale(camera, factor).params.tolist()
-    for row in np.flatnonzero(solution.registered):
+    for row in np.flatnonzero(solution.component == component):
         R, center = solution.cam_from_world_rotations[row], solution.projection_centers[row]
         image = reconstruction.image(int(solution.image_ids[row]))
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center)

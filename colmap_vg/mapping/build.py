@@ -55,6 +55,7 @@ def build_model(
     reconstruction: "pycolmap.Reconstruction",
     options: MappingOptions,
     log: StageLog,
+    others: frozenset[int] = frozenset(),
 ) -> BuildResult:
     """Triangulate and adjust a reconstruction of poses, in place, and register what is left.
 
@@ -65,6 +66,8 @@ def build_model(
         With the poses of the registered images, no points.
     options : MappingOptions
     log : StageLog
+    others : frozenset of int
+        Ids of images that have a model of their own; they are not registered in this one.
 
     Returns
     -------
@@ -94,7 +97,7 @@ def build_model(
         log.result(_state(reconstruction))
     with log.stage("register"):
         removed = _remove_unsupported(mapper)
-        added = _register_left_out(mapper, options, frozenset(removed))
+        added = _register_left_out(mapper, options, others | removed)
         if added or removed:
             mapper.complete_and_merge_tracks(triangulator)
             _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
