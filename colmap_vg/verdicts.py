@@ -1,52 +1,61 @@
-"""The words in which verdicts on edges, images and whole solutions are given."""
+"""The words in which verdicts on edges, images and whole solutions are given, each with its reason."""
 
 from enum import StrEnum
+from typing import Self
 
 
-class EdgeVerdict(StrEnum):
+class Verdict(StrEnum):
+    """A word and, as `reason`, the clause that says what it means."""
+
+    reason: str
+
+    def __new__(cls, word: str, reason: str) -> Self:
+        """Make a member that equals its word."""
+        member = str.__new__(cls, word)
+        member._value_ = word
+        member.reason = reason
+        return member
+
+
+class EdgeVerdict(Verdict):
     """Why an edge (a verified image pair) was kept or left out."""
 
-    KEPT = "kept"
-    ROTATION_ONLY = "rotation_only"
-    """Used for rotations; its direction says nothing (panoramic pair, vanishing baseline)."""
-    NO_POSE = "no_pose"
-    """No relative pose could be recovered from its inliers."""
-    DEGENERATE = "degenerate"
-    """COLMAP found no geometry that explains the matches."""
-    WATERMARK = "watermark"
-    """The matches move as an overlay does, not as a scene does."""
-    FEW_INLIERS = "few_inliers"
-    UNCALIBRATED = "uncalibrated"
-    """Explained by a fundamental matrix only, although the focal lengths are known: mostly a false pair."""
-    ROTATION_OUTLIER = "rotation_outlier"
-    """Its rotation contradicts the averaged rotations."""
-    DIRECTION_OUTLIER = "direction_outlier"
-    """Its direction contradicts the solved positions."""
-    ONE_DSFM = "one_dsfm"
-    """1DSfM's broken weight is above the threshold."""
-    REVERSED = "reversed"
-    """Its direction points away from the solved one."""
-    OUTSIDE = "outside_component"
-    """It lies outside what was solved, or links two models."""
+    KEPT = "kept", "rotation and direction were used"
+    ROTATION_ONLY = (
+        "rotation_only",
+        "used for rotations; its direction says nothing (panoramic pair, vanishing baseline)",
+    )
+    NO_POSE = "no_pose", "no relative pose explains its matches"
+    DEGENERATE = "degenerate", "COLMAP found no geometry that explains the matches"
+    WATERMARK = "watermark", "the matches move as an overlay does, not as a scene does"
+    FEW_INLIERS = "few_inliers", "fewer verified matches than `min_num_inliers`"
+    UNCALIBRATED = (
+        "uncalibrated",
+        "explained by a fundamental matrix only, although the focal lengths are known, and confirmed by nothing else",
+    )
+    ROTATION_OUTLIER = "rotation_outlier", "its rotation contradicts the averaged rotations"
+    DIRECTION_OUTLIER = "direction_outlier", "its direction contradicts the solved positions"
+    ONE_DSFM = "one_dsfm", "1DSfM's broken weight is above the threshold"
+    REVERSED = "reversed", "its direction points away from the solved one"
+    OUTSIDE = "outside_component", "it lies outside what was solved, or links two models"
 
 
-class ImageVerdict(StrEnum):
+class ImageVerdict(Verdict):
     """Why an image was registered or left out."""
 
-    REGISTERED = "registered"
-    """It is in the largest model."""
-    OTHER_MODEL = "other_model"
-    """It is in a smaller model of its own frame; nothing that holds links the two."""
-    NO_EDGES = "no_edges"
-    """No verified pair of this image could be used."""
-    SMALLER_COMPONENT = "smaller_component"
-    """It is connected only to images outside the largest component, too few for a model of their own."""
-    CUT_OFF = "cut_off"
-    """All edges that linked it to the solved images were outliers."""
-    NOT_RIGID = "not_rigid"
-    """Its edges do not fix its position relative to the others (for instance a single edge)."""
-    FEW_OBSERVATIONS = "few_observations"
-    """Too few triangulated points are seen in it."""
+    REGISTERED = "registered", "it is in the largest model"
+    OTHER_MODEL = "other_model", "it is in a smaller model, in a frame of its own; nothing that holds links the two"
+    NO_EDGES = "no_edges", "no verified pair of this image could be used"
+    SMALLER_COMPONENT = (
+        "smaller_component",
+        "it is connected only to images outside the largest component, too few for a model of their own",
+    )
+    CUT_OFF = "cut_off", "all edges that linked it to the solved images were outliers"
+    NOT_RIGID = "not_rigid", "its edges do not fix its position relative to the others (for instance a single edge)"
+    FEW_OBSERVATIONS = (
+        "few_observations",
+        "too few triangulated points that three images see at an angle are seen in it",
+    )
 
 
 class SolutionStatus(StrEnum):
@@ -58,4 +67,4 @@ class SolutionStatus(StrEnum):
     NOT_CONVERGED = "not_converged"
     """The iteration limit was reached; the poses are the best found."""
     UNSOLVABLE = "unsolvable"
-    """Nothing could be solved: no usable edges, or no two connected images."""
+    """Nothing could be solved: no usable edges, or no three images that fix each other."""

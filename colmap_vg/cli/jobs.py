@@ -12,7 +12,19 @@ from colmap_vg.image_folder import DATABASE_NAME, make_database
 from colmap_vg.mapper import MappingResult, map_database
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
 from colmap_vg.output_folder import publish_models, refuse_models, work_folder
+from colmap_vg.solution import PoseSolution
 from colmap_vg.stages import StageLog
+from colmap_vg.verdict_tables import (
+    bridges,
+    explain_image,
+    explain_job,
+    explain_pair,
+    image_names,
+    read_tables,
+    verdict_tables,
+    write_tables,
+)
+from colmap_vg.view_graph import ViewGraph
 
 
 def configure_colmap_log(verbose: bool) -> None:
@@ -87,19 +99,17 @@ def solve(
     if not solution.registered.any():
         raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")
     with log.stage("write"), work_folder(output_path, overwrite) as work:
-        staged = work / "0"
-        staged.mkdir(exist_ok=True)
+        staged = [work / str(component) for component in range(int(solution.component.max()) + 1)]
         with loaded_cache(database_path, work, read.min_num_inliers) as (cache, _):
-            reconstruction_from_solution(cache, solution, graph).write(staged)
-        publish_models([staged], output_path)
-        log.result(str(output_path / "0"))
+            for component, folder in enumerate(staged):
+                folder.mkdir(exist_ok=True)
+                reconstruction_from_solution(cache, solution, graph, component).write(folder)
+        log.result(", ".join(map(str, publish_models(staged, output_path))))
     asked = {"database_path": database_path, "output_path": output_path, "read": read, "solve": options}
     content = job_summary("solve", {**asked, "overwrite": overwrite, "resume": resume}, reporter)
-    names = graph.image_names or tuple(str(image_id) for image_id in graph.image_ids)
-    content["status"] = str(solution.status)
-    content["images"] = image_summary(names, solution.image_verdicts.tolist(), solution.registered.tolist())
-    content["edges"] = edge_summary(solution.edge_verdicts.tolist(), solution.edge_kept.tolist())
+    content |= _verdicts(graph, solution, output_path, {})
     write_summary(output_path, content)
+    names = image_names(graph)
     reporter.say(f"{int(solution.registered.sum())} of {len(names)} images registered: {output_path / '0'}")
 
 
@@ -136,6 +146,14 @@ def demo(
     reporter.say(comparison.summary)
 
 
+def explain(output_path: Path, image: str | None, pair: tuple[str, str] | None) -> list[str]:
+    """What a finished job made of everything, of one image, or of one pair."""
+    tables = read_tables(output_path)
+    if pair is not None:
+        return explain_pair(tables, *pair)
+    return explain_job(tables) if image is None else explain_image(tables, image)
+
+
 def _finish(
     verb: str,
     asked: Mapping[str, object],
@@ -146,19 +164,28 @@ def _finish(
     further: Mapping[str, object] | None = None,
 ) -> None:
     """Write the summary of a mapping job, and say what came out."""
-    skipped = skipped or {}
-    names, solution = mapped.graph.image_names, mapped.solution
     content = job_summary(verb, asked, reporter)
-    content["status"] = str(solution.status)
-    content["images"] = image_summary(
-        [*names, *skipped],
-        [*solution.image_verdicts.tolist(), *skipped.values()],
-        [*solution.registered.tolist(), *[False] * len(skipped)],
-    )
-    content["edges"] = edge_summary(solution.edge_verdicts.tolist(), solution.edge_kept.tolist())
+    content |= _verdicts(mapped.graph, mapped.solution, output_path, skipped or {})
     content["models"] = [model_summary(output_path / str(index), model) for index, model in mapped.models.items()]
     write_summary(output_path, {**content, **(further or {})})
     for index, model in mapped.models.items():
-        size = f"{model.num_reg_images()} of {len(names)} images, {model.num_points3D()} points"
+        size = f"{model.num_reg_images()} of {mapped.graph.num_images} images, {model.num_points3D()} points"
         error = f"mean reprojection error {model.compute_mean_reprojection_error():.2f} px"
         reporter.say(f"{output_path / str(index)}: {size}, {error}")
+
+
+def _verdicts(
+    graph: ViewGraph, solution: PoseSolution, output_path: Path, skipped: Mapping[str, str]
+) -> dict[str, object]:
+    """The summary's part on images and pairs; the tables of all of them are written beside it."""
+    write_tables(output_path, verdict_tables(graph, solution, skipped))
+    return {
+        "status": str(solution.status),
+        "images": image_summary(
+            [*image_names(graph), *skipped],
+            [*solution.image_verdicts.tolist(), *skipped.values()],
+            [*(solution.component >= 0).tolist(), *[False] * len(skipped)],
+        ),
+        "edges": edge_summary(solution.edge_verdicts.tolist(), solution.edge_kept.tolist()),
+        "bridges": bridges(graph, solution),
+    }

@@ -287,6 +287,26 @@ def demo(
         jobs.demo(output_path, num_images, seed, num_threads, overwrite, resume, reporter)
 
 
+@app.command()
+def explain(
+    output_path: Annotated[Path, typer.Option("--output_path", help="Folder of a finished job.")],
+    image: Annotated[
+        str | None, typer.Option("--image", metavar="NAME", help="What became of this image, and why.")
+    ] = None,
+    pair: Annotated[
+        tuple[str, str] | None, typer.Option("--pair", metavar="A B", help="What became of this pair, and why.")
+    ] = None,
+) -> None:
+    """Say what a finished job made of its images and pairs, and why."""
+    if image is not None and pair is not None:
+        raise typer.BadParameter("--image and --pair are two questions: ask one")
+    with _job(False, False) as reporter:
+        import colmap_vg.cli.jobs as jobs
+
+        for line in jobs.explain(output_path, image, pair):
+            reporter.say(line)
+
+
 def main() -> None:
     """Entry point of ``colmap-vg`` and ``python -m colmap_vg``."""
     try:

@@ -351,3 +351,22 @@ def test_ctrl_c_ends_with_130_and_leaves_no_model(tmp_path: Path, images_path: P
     assert "--resume" in errors.splitlines()[-1]
     assert not (tmp_path / "out" / "0").exists()
     assert not (tmp_path / "out" / "database.db").exists()
+
+
+def test_a_finished_job_explains_itself(database_path: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    assert invoke("mapper", "--database_path", database_path, "--output_path", output).exit_code == 0
+    names = [image.name for image in pycolmap.Reconstruction(output / "0").images.values()]
+    result = invoke("explain", "--output_path", output)
+    assert result.exit_code == 0
+    assert "model 0: 10 images" in result.output
+    result = invoke("explain", "--output_path", output, "--image", names[0])
+    assert result.exit_code == 0
+    assert "registered" in result.output
+    result = invoke("explain", "--output_path", output, "--pair", names[0], names[1])
+    assert "verified matches" in result.output
+    result = invoke("explain", "--output_path", output, "--image", "nobody.jpg")
+    assert result.exit_code == 1
+    assert "error: no image" in result.stderr
+    assert invoke("explain", "--output_path", output, "--image", "a", "--pair", "a", "b").exit_code == 2
+    assert invoke("explain", "--output_path", tmp_path).exit_code == 1

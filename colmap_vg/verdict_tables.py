@@ -1,0 +1,275 @@
+"""What became of every image and pair, as two CSV tables beside the models, and answers from them.
+
+The tables hold one row per image and per verified pair of the database, with the verdict and how far the pair's own
+relative pose is from that of the finished model.
+"""
+
+import csv
+import io
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.errors import DataFileError, OutputError
+from colmap_vg.geometry.directions import normalized
+from colmap_vg.rotations.robust import rotation_residuals
+from colmap_vg.solution import PoseSolution
+from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
+from colmap_vg.view_graph import ViewGraph
+
+IMAGES_NAME, PAIRS_NAME = "images.csv", "pairs.csv"
+_IMAGE_COLUMNS = ("image", "model", "verdict", "num_pairs", "num_kept_pairs")
+_PAIR_COLUMNS = ("image1", "image2", "verdict", "num_inliers", "rotation_error_deg", "direction_error_deg")
+MAX_PAIRS_SHOWN = 30
+
+
+@dataclass(frozen=True)
+class ImageRow:
+    """An image of a finished job; `model` is empty where it is in none."""
+
+    image: str
+    model: str
+    verdict: str
+    num_pairs: int
+    num_kept_pairs: int
+
+
+@dataclass(frozen=True)
+class PairRow:
+    """A verified pair of a finished job; errors are empty where its images do not share a model."""
+
+    image1: str
+    image2: str
+    verdict: str
+    num_inliers: str
+    rotation_error_deg: str
+    direction_error_deg: str
+
+
+@dataclass(frozen=True)
+class VerdictTables:
+    """The rows of both tables."""
+
+    images: tuple[ImageRow, ...]
+    pairs: tuple[PairRow, ...]
+
+
+def verdict_tables(graph: ViewGraph, solution: PoseSolution, skipped: Mapping[str, str] | None = None) -> VerdictTables:
+    """Tables of a graph and what was made of it.
+
+    Parameters
+    ----------
+    graph : ViewGraph
+    solution : PoseSolution
+    skipped : mapping of str to str, optional
+        Files that never became images, with their reasons.
+    """
+    names = image_names(graph)
+    count = np.bincount(graph.edges.ravel(), minlength=graph.num_images)
+    kept = np.bincount(graph.edges[solution.edge_kept].ravel(), minlength=graph.num_images)
+    images = [
+        ImageRow(name, str(component) if component >= 0 else "", str(verdict), int(pairs), int(kept_pairs))
+        for name, component, verdict, pairs, kept_pairs in zip(
+            names, solution.component.tolist(), solution.image_verdicts, count, kept, strict=True
+        )
+    ]
+    images += [ImageRow(name, "", reason, 0, 0) for name, reason in (skipped or {}).items()]
+    rotation, direction = pose_errors_deg(graph, solution)
+    inliers = [""] * graph.num_edges if graph.num_inliers is None else [str(k) for k in graph.num_inliers.tolist()]
+    pairs = [
+        PairRow(names[i], names[j], str(verdict), k, _number(r), _number(d))
+        for (i, j), verdict, k, r, d in zip(
+            graph.edges.tolist(), solution.edge_verdicts, inliers, rotation, direction, strict=True
+        )
+    ]
+    return VerdictTables(tuple(images), tuple(pairs))
+
+
+def image_names(graph: ViewGraph) -> list[str]:
+    """Names of a graph's images; their ids where it has none."""
+    return list(graph.image_names or map(str, graph.image_ids.tolist()))
+
+
+def pose_errors_deg(graph: ViewGraph, solution: PoseSolution) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Angles (m,) between the edges' rotations and directions and those of the solution; NaN where there is none."""
+    i, j = graph.edges.T
+    same = (solution.component[i] >= 0) & (solution.component[i] == solution.component[j])
+    R, p = solution.cam_from_world_rotations, solution.projection_centers
+    rotation, direction = np.full((2, graph.num_edges), np.nan)
+    known = same & graph.has_rotation
+    rotation[known] = np.degrees(rotation_residuals(graph.edges[known], graph.cam2_from_cam1_rotations[known], R))
+    known = same & graph.has_direction
+    solved = normalized(np.einsum("kab,kb->ka", R[i[known]], p[j[known]] - p[i[known]]))
+    chord = np.linalg.norm(solved - graph.cam2_in_cam1_directions[known], axis=1)
+    direction[known] = np.degrees(2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0)))
+    return rotation, direction
+
+
+def bridges(graph: ViewGraph, solution: PoseSolution, num_shown: int = 10) -> list[dict[str, object]]:
+    """Pairs that link two models, by models; the strongest by name."""
+    names, ends = image_names(graph), np.sort(solution.component[graph.edges], axis=1)
+    linking = np.flatnonzero((ends[:, 0] >= 0) & (ends[:, 0] != ends[:, 1]))
+    inliers = np.zeros(graph.num_edges, dtype=np.int64) if graph.num_inliers is None else graph.num_inliers
+    found = []
+    for models in np.unique(ends[linking], axis=0):
+        rows = linking[(ends[linking] == models).all(axis=1)]
+        strongest = rows[np.argsort(-inliers[rows], kind="stable")][:num_shown]
+        pairs = [
+            {
+                "images": [names[a] for a in graph.edges[row]],
+                "verdict": str(solution.edge_verdicts[row]),
+                "num_inliers": int(inliers[row]),
+            }
+            for row in strongest
+        ]
+        found.append({"models": models.tolist(), "num_pairs": len(rows), "strongest": pairs})
+    return found
+
+
+def write_tables(output_path: Path, tables: VerdictTables) -> None:
+    """Write both tables, each whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written.
+    """
+    content: tuple[tuple[str, Sequence[str], Sequence[ImageRow | PairRow]], ...] = (
+        (IMAGES_NAME, _IMAGE_COLUMNS, tables.images),
+        (PAIRS_NAME, _PAIR_COLUMNS, tables.pairs),
+    )
+    for name, columns, rows in content:
+        text = io.StringIO()
+        writer = csv.writer(text)
+        writer.writerow(columns)
+        writer.writerows([[getattr(row, column) for column in columns] for row in rows])
+        temporary = output_path / f".{name}.{os.getpid()}"
+        try:
+            temporary.write_text(text.getvalue(), encoding="utf-8", errors="surrogateescape", newline="")
+            temporary.replace(output_path / name)
+        except OSError as error:
+            raise OutputError(f"cannot write {output_path / name}: {error.strerror}") from error
+
+
+def read_tables(output_path: Path) -> VerdictTables:
+    """Tables that a finished job left.
+
+    Raises
+    ------
+    DataFileError
+        They are not there, or damaged.
+    """
+    images = [
+        ImageRow(r["image"], r["model"], r["verdict"], int(r["num_pairs"]), int(r["num_kept_pairs"]))
+        for r in _rows(output_path / IMAGES_NAME, _IMAGE_COLUMNS)
+    ]
+    pairs = [PairRow(*(r[column] for column in _PAIR_COLUMNS)) for r in _rows(output_path / PAIRS_NAME, _PAIR_COLUMNS)]
+    return VerdictTables(tuple(images), tuple(pairs))
+
+
+def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
+    try:
+        with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise DataFileError(
+            f"{path}: {error.strerror}; --output_path takes the folder of a finished run or mapper job"
+        ) from error
+    for number, row in enumerate(rows, start=2):
+        if any(row.get(column) is None for column in columns):
+            raise DataFileError(f"{path}, line {number}: not the columns {', '.join(columns)}; run the job again")
+    return rows
+
+
+def explain_job(tables: VerdictTables) -> list[str]:
+    """Lines on all models, what was left out, and the pairs by verdict."""
+    models = Counter(row.model for row in tables.images if row.model)
+    lines = [f"model {model}: {count} images" for model, count in sorted(models.items(), key=lambda m: int(m[0]))]
+    left_out = [row for row in tables.images if not row.model]
+    lines.append(f"left out: {len(left_out)} of {len(tables.images)} images")
+    lines += [f"  {row.image}: {row.verdict} ({image_reason(row.verdict)})" for row in left_out]
+    lines.append(f"pairs: {len(tables.pairs)}")
+    for verdict, count in Counter(row.verdict for row in tables.pairs).most_common():
+        lines.append(f"  {count} {verdict} ({edge_reason(verdict)})")
+    return lines
+
+
+def explain_image(tables: VerdictTables, name: str) -> list[str]:
+    """Lines on one image and its pairs, the strongest first.
+
+    Raises
+    ------
+    DataFileError
+        There is no such image.
+    """
+    row = _image(tables, name)
+    place = f"in model {row.model}" if row.model else "left out"
+    lines = [f"{row.image}: {place}, {row.verdict} ({image_reason(row.verdict)})"]
+    lines.append(f"  {row.num_kept_pairs} of its {row.num_pairs} pairs were kept")
+    pairs = [pair for pair in tables.pairs if name in (pair.image1, pair.image2)]
+    pairs.sort(key=lambda pair: -int(pair.num_inliers or 0))
+    for pair in pairs[:MAX_PAIRS_SHOWN]:
+        other = pair.image2 if pair.image1 == name else pair.image1
+        lines.append(f"  {other}: {_described(pair)}")
+    if len(pairs) > MAX_PAIRS_SHOWN:
+        lines.append(f"  and {len(pairs) - MAX_PAIRS_SHOWN} more in {PAIRS_NAME}")
+    return lines
+
+
+def explain_pair(tables: VerdictTables, name1: str, name2: str) -> list[str]:
+    """Lines on a pair and its images.
+
+    Raises
+    ------
+    DataFileError
+        There is no such image.
+    """
+    images = [_image(tables, name) for name in (name1, name2)]
+    found = [pair for pair in tables.pairs if {pair.image1, pair.image2} == {name1, name2}]
+    lines = [f"{name1} and {name2}: {_described(pair)}" for pair in found]
+    lines += [f"  {edge_reason(pair.verdict)}" for pair in found]
+    if not found:
+        lines = [f"{name1} and {name2}: no verified pair; too few of their features match, or they were not compared"]
+    for row in images:
+        lines.append(f"  {row.image}: " + (f"in model {row.model}" if row.model else f"left out, {row.verdict}"))
+    return lines
+
+
+def image_reason(word: str) -> str:
+    """What a verdict on an image means; a skipped file's word is its own reason."""
+    return {str(verdict): verdict.reason for verdict in ImageVerdict}.get(word, word)
+
+
+def edge_reason(word: str) -> str:
+    """What a verdict on a pair means."""
+    return {str(verdict): verdict.reason for verdict in EdgeVerdict}.get(word, word)
+
+
+def _image(tables: VerdictTables, name: str) -> ImageRow:
+    for row in tables.images:
+        if row.image == name:
+            return row
+    near = get_close_matches(name, [row.image for row in tables.images], n=3, cutoff=0.4)
+    hint = f"did you mean {', '.join(near)}?" if near else f"{IMAGES_NAME} lists them"
+    raise DataFileError(f"no image {name!r} among the {len(tables.images)} of this job; {hint}")
+
+
+def _described(pair: PairRow) -> str:
+    parts = [pair.verdict]
+    if pair.num_inliers:
+        parts.append(f"{pair.num_inliers} verified matches")
+    if pair.rotation_error_deg:
+        parts.append(f"rotation {pair.rotation_error_deg}° off the model")
+    if pair.direction_error_deg:
+        parts.append(f"direction {pair.direction_error_deg}° off the model")
+    return ", ".join(parts)
+
+
+def _number(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.3f}"
