@@ -161,7 +161,8 @@ def _build(
     log: StageLog,
 ) -> list[_Model]:
     """Models of all components that the points support, the one with most images first."""
-    shared = shared_cameras(graph) if options.share_cameras else []
+    refined = options.ba_refine_focal_length or options.ba_refine_principal_point or options.ba_refine_extra_params
+    shared = shared_cameras(graph) if options.share_cameras and refined else []
     with log.stage("load"):
         with loaded_cache(database_path, work, options.read.min_num_inliers, shared) as (cache, replaced):
             components = range(int(solution.component.max()) + 1)

@@ -93,7 +93,7 @@ class MappingOptions(_Checked):
     ba_refine_focal_length: bool = True
     ba_refine_principal_point: bool = False
     ba_refine_extra_params: bool = True
-    share_cameras: bool = True  # photographs without EXIF, of one size, whose pairs find one focal length, share a lens
+    share_cameras: bool = True  # photographs of one size that start with one calibration share a lens
     extract_colors: bool = True
     overwrite: bool = False
     num_threads: int = _number(-1, -1)  # -1: all cores

@@ -79,7 +79,9 @@ RefineIntrinsics = Annotated[
 ExtractColors = Annotated[str, typer.Option(*colmap_flags.EXTRACT_COLORS, metavar="0|1")]
 ShareCameras = Annotated[
     str,
-    typer.Option("--share_cameras", metavar="0|1", help="One lens for photographs without EXIF that show no other."),
+    typer.Option(
+        "--share_cameras", metavar="0|1", help="One lens for photographs of one calibration that show no other."
+    ),
 ]
 NumThreads = Annotated[int, typer.Option(*colmap_flags.NUM_THREADS, help="-1: all cores.")]
 RandomSeed = Annotated[int, typer.Option(*colmap_flags.RANDOM_SEED, help="Same seed and threads, same result.")]

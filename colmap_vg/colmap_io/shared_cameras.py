@@ -1,7 +1,8 @@
-"""One calibration for photographs without EXIF that show no sign of different lenses.
+"""One calibration for photographs that start with the same one and show no sign of different lenses.
 
-COLMAP gives each of them a camera of its own, and most are too weak to calibrate alone. While the model is built they
-share one, in a copy of the database; the finished model has the database's own cameras again, with equal parameters.
+COLMAP gives each photograph without EXIF a camera of its own, and most are too weak to calibrate alone. While the
+model is built they share one, in a copy of the database; the finished model has the database's own cameras again, with
+equal parameters.
 """
 
 import sqlite3
@@ -12,16 +13,15 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_vg.epipolar.problem import focal_groups
 from colmap_vg.view_graph import ViewGraph
 
 
 def shared_cameras(graph: ViewGraph) -> list[list[int]]:
-    """Ids of cameras whose unknown focal length was found in common, two or more each."""
-    if graph.camera_ids is None:
+    """Ids of cameras of one focal length, given or found in common; two or more each."""
+    if graph.camera_ids is None or graph.camera_focal_lengths is None:
         return []
-    group, first = focal_groups(graph)
-    members = [graph.camera_ids[group == g].tolist() for g in range(len(first))]
+    focals, group = np.unique(graph.camera_focal_lengths, return_inverse=True)
+    members = [graph.camera_ids[group == g].tolist() for g in range(len(focals))]
     return [ids for ids in members if len(ids) > 1]
 
 

@@ -69,8 +69,27 @@ def test_lenses_that_differ_are_found_out(tmp_path: Path) -> None:
     np.testing.assert_allclose(focals[1::2], 1280.0, rtol=0.03)
 
 
-def test_given_focal_lengths_are_not_shared(tmp_path: Path) -> None:
-    make_database(tmp_path / "true.db", camera=RADIAL, camera_per_image=True)
+def test_equal_given_calibrations_are_refined_as_one(tmp_path: Path) -> None:
+    path = tmp_path / "true.db"
+    truth = make_database(path, noise_px=0.5, camera=RADIAL, camera_per_image=True, num_points=400)
+    (ids,) = shared_cameras(read_view_graph(path))
+    assert ids == sorted(truth.cameras)
+    errors = {}
+    for share in (True, False):
+        model = view_graph_mapping(path, None, tmp_path / str(share), MappingOptions(share_cameras=share))[0]
+        params = np.array([camera.params for camera in model.cameras.values()])
+        assert (np.ptp(params, axis=0).max() == 0.0) == share
+        image_ids = sorted(model.reg_image_ids())
+        errors[share] = align_positions(centers(model, image_ids), centers(truth, image_ids))[0].mean()
+    assert errors[True] < errors[False]
+
+
+def test_given_calibrations_that_differ_are_not_shared(tmp_path: Path) -> None:
+    make_database(tmp_path / "true.db", camera=RADIAL, camera_per_image=True, num_images=4)
+    with closing(sqlite3.connect(tmp_path / "true.db")) as connection, connection:
+        for camera_id in range(1, 5):
+            params = np.array([1280.0 + camera_id, 512.0, 384.0, 0.05]).tobytes()
+            connection.execute("UPDATE cameras SET params = ? WHERE camera_id = ?", (params, camera_id))
     assert shared_cameras(read_view_graph(tmp_path / "true.db")) == []
 
 
