@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_equations
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem
-from colmap_vg.epipolar.sampson import cauchy_costs, frames, normal_equations, residuals_by_block
+from colmap_vg.epipolar.sampson import cauchy_costs, frames, normal_equations, residuals
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
@@ -31,6 +31,8 @@ BoolArray = NDArray[np.bool_]
 
 _MAX_DAMPING = 1e6  # shares of the Hessian's diagonal
 _SHORTEST_BASELINE = 1e-6  # of the RMS distance of cameras; keeps the direction of coinciding cameras finite
+_MIN_SLOPE = 0.25  # of the weights; reweighted least squares takes one, and Newton's method half of it for plain noise
+_COARSE = 300.0  # the next scale moves the cameras more than the last digits of this one
 _MAX_LOG_FOCAL_STEP = 0.3
 _MAX_LOG_FOCAL = np.log(3.0)  # cameras with nearly no focal length see anything without an error
 _MIN_SIGMA_PX = 0.05  # pixels; no keypoints are better, and exact data keep a finite scale
@@ -138,7 +140,7 @@ def adjust_epipolar(
     max_num_iterations : int
         Steps at each scale.
     tolerance : float
-        Relative change of the cost at which the last scale ends; earlier ones end at a hundred times that.
+        Relative change of the cost at which the last scale ends; earlier ones end at three hundred times that.
 
     Returns
     -------
@@ -182,7 +184,7 @@ def _in_stages(
             scale = scales_px[stage]
         else:
             scale = min(scale, max(final_sigmas * _sigma(problem, cameras), _MIN_SIGMA_PX))
-        end = tolerance if last else 100.0 * tolerance
+        end = tolerance if last else _COARSE * tolerance
         cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log)
         if _ran_away(cameras):
             break
@@ -208,8 +210,7 @@ def _in_stages(
 def _sigma(problem: EpipolarProblem, cameras: Cameras) -> float:
     """Robust standard deviation of all matches' Sampson errors, pixels."""
     R, d, _ = cameras.relative(problem.edges)
-    blocks = residuals_by_block(problem.matches(cameras.log_scales), R, d)
-    return MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate([r for *_, r in blocks]))))
+    return MAD_TO_SIGMA * float(np.median(np.abs(residuals(problem.matches(cameras.log_scales), R, d))))
 
 
 def _ran_away(cameras: Cameras) -> bool:
@@ -251,7 +252,8 @@ def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float) -> list[Cam
         problem.matches(cameras.log_scales), R, d, np.full(len(edges), scale), with_focals=with_focals
     )
     chain = edge_chain(cameras.rotations[edges[:, 0]], R, d, length)
-    terms = [CameraTerms.chained(edges, at.costs, at.gradients, at.hessians, chain)]
+    hessians = at.hessians * np.maximum(at.slopes, _MIN_SLOPE)[:, None, None]
+    terms = [CameraTerms.chained(edges, at.costs, at.gradients, hessians, chain)]
     if problem.triplets is not None:
         images = problem.triplets.images
         rays = problem.triplet_rays(problem.triplets, cameras.log_scales)

@@ -20,13 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.sampson import segment_totals
-from colmap_vg.two_view.segments import segment_of_rows
+from colmap_vg.epipolar.pieces import Block, Pieces, shrunk
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-_ROWS_PER_BLOCK = 16_384  # tracks; the columns of one block stay in the second-level cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +32,17 @@ class TripletRays:
 
     Attributes
     ----------
-    offsets : (q + 1,) int64 array
-        Tracks of triplet k are rows ``offsets[k]:offsets[k + 1]``.
-    bearings : (3, 3, k) array
-        Unit rays in a, b and c, each in its own camera; components second.
+    pieces : Pieces
+        Unit rays in a, b and c, each in its own camera: nine columns.
     variances : (3, q) array
         ``1 / f^2``, squared radians per squared pixel.
+    shrinks : (3, q) array or None
+        Factors on the first two coordinates of the rays, which are then normalised: those of a longer focal length.
     """
 
-    offsets: IntArray
-    bearings: Array
+    pieces: Pieces
     variances: Array
+    shrinks: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,37 +72,36 @@ class TripletEquations:
 
 def depth_residuals(rays: TripletRays, poses: TripletPoses) -> Array:
     """Residuals of all tracks in pixels: (k,)."""
-    r = np.empty(int(rays.offsets[-1]))
-    for triplets, rows, offsets in _blocks(rays.offsets):
-        r[rows] = _evaluate(rays, poses, triplets, rows, offsets).r
-    return r
+    parts = [rays.pieces.rows(_evaluate(rays, poses, block).r, block) for block in rays.pieces.blocks()]
+    return np.concatenate([np.zeros(0), *parts])
 
 
 def depth_costs(rays: TripletRays, poses: TripletPoses, scale: float) -> Array:
     """``sum s^2 log(1 + r^2 / s^2)`` of each triplet, with the scale s in pixels: (q,)."""
-    r = depth_residuals(rays, poses)
-    return scale**2 * segment_totals(rays.offsets, np.log1p(np.square(r / scale)))
+    costs = np.zeros(rays.pieces.num_segments)
+    for block in rays.pieces.blocks():
+        ratio = np.square(_evaluate(rays, poses, block).r / scale)
+        costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
+    return scale**2 * costs
 
 
 def depth_equations(
     rays: TripletRays, poses: TripletPoses, scale: float, *, with_focals: bool = False
 ) -> TripletEquations:
     """Cauchy costs and their normal equations by (turn a, turn c, t of a, t of c), and the log focals where asked."""
-    q, b = len(rays.offsets) - 1, 15 if with_focals else 12
-    upper = np.triu_indices(b)
-    costs, gradients, hessians = np.zeros(q), np.zeros((q, b)), np.zeros((q, b, b))
-    for triplets, rows, offsets in _blocks(rays.offsets):
-        at = _evaluate(rays, poses, triplets, rows, offsets)
-        J = _jacobian(at, with_focals)
+    q, b = rays.pieces.num_segments, 15 if with_focals else 12
+    costs, products = np.zeros(q), np.zeros((q, b, b + 1))
+    for block in rays.pieces.blocks():
+        at = _evaluate(rays, poses, block)
+        columns = _jacobian_and_residuals(at, with_focals)
         ratio = np.square(at.r / scale)
-        weighted = J / (1.0 + ratio)
-        costs[triplets] = scale**2 * segment_totals(offsets, np.log1p(ratio))
-        gradients[triplets] = segment_totals(offsets, weighted * at.r).T
-        totals = segment_totals(offsets, weighted[upper[0]] * J[upper[1]]).T
-        block = hessians[triplets]
-        block[:, upper[0], upper[1]] = totals
-        block[:, upper[1], upper[0]] = totals
-    return TripletEquations(costs, gradients, hessians)
+        weighted = columns[:, :b] / (1.0 + ratio)[:, None]
+        costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
+        products[block.segments] = block.totals(weighted @ np.swapaxes(columns, 1, 2))
+    hessians = products[:, :, :b]
+    # Both triangles were summed; their last digits differ.
+    hessians = 0.5 * (hessians + np.swapaxes(hessians, 1, 2))
+    return TripletEquations(scale**2 * costs, products[:, :, b], hessians)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,18 +121,25 @@ def depth_derivatives_by_block(
     rays: TripletRays, poses: TripletPoses, *, with_focals: bool = False
 ) -> Iterator[tuple[slice, slice, IntArray, DepthDerivatives]]:
     """Runs of whole triplets: their slice, their rows' slice, offsets from the first row, and derivatives."""
-    for triplets, rows, offsets in _blocks(rays.offsets):
-        at = _evaluate(rays, poses, triplets, rows, offsets)
-        v = rays.variances[:, triplets][:, segment_of_rows(offsets)]
-        by_rays = np.stack(at.along) / np.sqrt(v * at.variance)[:, None]
+    pieces = rays.pieces
+    for block in pieces.blocks():
+        at = _evaluate(rays, poses, block)
+        by_rays = np.stack(at.along) / np.sqrt(at.variances * at.variance)[:, None]
         for image in (0, 2):
-            by_rays[image] = np.einsum("bak,bk->ak", at.turns[image // 2], by_rays[image])
-        yield triplets, rows, offsets, DepthDerivatives(at.r, _jacobian(at, with_focals), by_rays)
+            by_rays[image] = _turned(np.swapaxes(at.turns[image // 2], 1, 2), np.moveaxis(by_rays[image], 0, 1))
+        by_pose = np.moveaxis(_jacobian_and_residuals(at, with_focals)[:, :-1], 1, 0)
+        offsets = pieces.offsets[block.segments.start : block.segments.stop + 1]
+        yield (
+            block.segments,
+            slice(int(offsets[0]), int(offsets[-1])),
+            offsets - offsets[0],
+            DepthDerivatives(pieces.rows(at.r, block), pieces.rows(by_pose, block), pieces.rows(by_rays, block)),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """Inverse depth in b by one other image, and its derivatives by the rays and the baseline; (3, k) arrays."""
+    """Inverse depth in b by one other image, and its derivatives by the rays and the baseline: (3, pieces, length)."""
 
     u: Array
     t: Array
@@ -153,11 +156,15 @@ class _Side:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """A block of tracks: dh/du of each image (`by_ray`), g (`along`), g . G (`noise`), s^2, r, and their sources."""
+    """A block of tracks: dh/du of each image (`by_ray`), g (`along`), g . G (`noise`), s^2, r, and their sources.
+
+    Vectors are (3, pieces, length); own rays (3, pieces, 3, length), turns (2, pieces, 3, 3), variances (3, pieces, 1).
+    """
 
     own: Array
     turns: Array
     middle: Array
+    variances: Array
     sides: tuple[_Side, _Side]
     by_ray: list[Array]
     along: list[Array]
@@ -166,24 +173,30 @@ class _Tracks:
     r: Array
 
 
-def _evaluate(rays: TripletRays, poses: TripletPoses, triplets: slice, rows: slice, offsets: IntArray) -> _Tracks:
-    triplet = segment_of_rows(offsets)
-    own = rays.bearings[:, :, rows]
-    turns = poses.rotations[:, triplets].transpose(0, 2, 3, 1)[..., triplet]
-    middle = own[1]
-    sides = tuple(
-        _side(np.einsum("abk,bk->ak", turns[s], own[2 * s]), middle, poses.baselines[s, triplets].T[:, triplet])
-        for s in (0, 1)
-    )
-    a, c = sides
+def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
+    triplet = rays.pieces.segments[block.pieces]
+    columns = rays.pieces.columns[block.pieces]
+    own = np.stack([columns[:, 3 * s : 3 * s + 3] for s in range(3)])
+    if rays.shrinks is not None:
+        own = np.stack([shrunk(x, factor[triplet]) for x, factor in zip(own, rays.shrinks, strict=True)])
+    turns, baselines = poses.rotations[:, triplet], poses.baselines[:, triplet]
+    middle = np.moveaxis(own[1], 1, 0)
+    a, c = (_side(_turned(turns[s], own[2 * s]), middle, baselines[s].T[:, :, None]) for s in (0, 1))
+    variances = rays.variances[:, triplet, None]
     by_ray = [a.by_own, a.by_middle - c.by_middle, -c.by_own]
     along, noise = [], []
-    for G, u, v in zip(by_ray, (a.u, middle, c.u), rays.variances[:, triplets][:, triplet], strict=True):
+    for G, u, v in zip(by_ray, (a.u, middle, c.u), variances, strict=True):
         tangential = G - _dot(G, u) * u
         along.append(v * tangential)
         noise.append(v * _dot(tangential, tangential))
     variance = np.maximum(noise[0] + noise[1] + noise[2], np.finfo(float).tiny)
-    return _Tracks(own, turns, middle, (a, c), by_ray, along, noise, variance, (a.rho - c.rho) / np.sqrt(variance))
+    r = (a.rho - c.rho) / np.sqrt(variance)
+    return _Tracks(own, turns, middle, variances, (a, c), by_ray, along, noise, variance, r)
+
+
+def _turned(turns: Array, x: Array) -> Array:
+    """Turned vectors (pieces, 3, length), components first."""
+    return np.moveaxis(turns @ x, 1, 0)
 
 
 def _side(u: Array, middle: Array, t: Array) -> _Side:
@@ -221,8 +234,8 @@ def _derivative(side: _Side, middle: Array, du: Array, dmiddle: Array) -> tuple[
     return by_middle, by_own, _cross(dbeta, side.u) + _cross(side.beta, du)
 
 
-def _jacobian(at: _Tracks, with_focals: bool) -> Array:
-    """Derivatives of the residuals: (12, k), or (15, k) with the focal lengths."""
+def _jacobian_and_residuals(at: _Tracks, with_focals: bool) -> Array:
+    """Derivatives of the residuals, 12 or with the focal lengths 15, and the residuals: (pieces, 13 or 16, length)."""
     (a, c), rays = at.sides, (at.sides[0].u, at.middle, at.sides[1].u)
     bend_a = _derivative(a, at.middle, at.along[0], at.along[1])
     bend_c = _derivative(c, at.middle, at.along[2], at.along[1])
@@ -233,17 +246,21 @@ def _jacobian(at: _Tracks, with_focals: bool) -> Array:
         G * inverse - ratio * (bend - _dot(G, u) * along)
         for G, bend, u, along in zip(at.by_ray, bends, rays, at.along, strict=True)
     ]
-    J = np.empty((15 if with_focals else 12, len(at.r)))
+    count, length = at.r.shape
+    whole = np.empty((count, 16 if with_focals else 13, length))
+    J = np.moveaxis(whole, 1, 0)
     J[0:3], J[3:6] = _cross(a.u, by_ray[0]), _cross(c.u, by_ray[2])
     J[6:9] = a.by_baseline * inverse - ratio * bend_a[2]
     J[9:12] = -(c.by_baseline * inverse - ratio * bend_c[2])
     if with_focals:
+        axis = np.array([0.0, 0.0, 1.0])[:, None]
         for k, x in enumerate(at.own):
-            pull = x[2] * (np.array([[0.0], [0.0], [1.0]]) - x[2] * x)
-            if k != 1:
-                pull = np.einsum("abk,bk->ak", at.turns[k // 2], pull)
+            depth = x[:, 2:]
+            pull = depth * (axis - depth * x)
+            pull = np.moveaxis(pull, 1, 0) if k == 1 else _turned(at.turns[k // 2], pull)
             J[12 + k] = _dot(by_ray[k], pull) + ratio * at.noise[k]
-    return J
+    J[-1] = at.r
+    return whole
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -252,13 +269,3 @@ def _cross(a: Array, b: Array) -> Array:
 
 def _dot(a: Array, b: Array) -> Array:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
-
-
-def _blocks(offsets: IntArray) -> Iterator[tuple[slice, slice, IntArray]]:
-    """Runs of whole triplets of about `_ROWS_PER_BLOCK` rows: triplets, rows, and offsets from the first row."""
-    first, last = 0, len(offsets) - 1
-    while first < last:
-        stop = int(np.searchsorted(offsets, offsets[first] + _ROWS_PER_BLOCK, side="right")) - 1
-        stop = min(max(stop, first + 1), last)
-        yield slice(first, stop), slice(offsets[first], offsets[stop]), offsets[first : stop + 1] - offsets[first]
-        first = stop

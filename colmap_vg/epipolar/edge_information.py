@@ -16,13 +16,12 @@ from colmap_vg.epipolar.sampson import (
     median_errors,
     moved,
     normal_equations,
-    residuals_by_block,
-    segment_totals,
+    residuals,
 )
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.robust import EFFICIENT_CAUCHY, MAD_TO_SIGMA
-from colmap_vg.two_view.segments import segment_of_rows
+from colmap_vg.two_view.segments import segment_sums
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -93,20 +92,17 @@ def refine_relative_poses(
     -------
     RefinedEdges
     """
-    matches = Matches(offsets, bearings1, bearings2, focal_lengths1**-2.0, focal_lengths2**-2.0)
-    R, d = rotations.astype(np.float64), normalized(directions.astype(np.float64))
     filled = np.flatnonzero(np.diff(offsets) > 0)
+    m = len(rotations)
+    R, d = rotations.astype(np.float64), normalized(directions.astype(np.float64))
+    information, median, sigma = np.zeros((m, 5, 5)), np.full(m, np.nan), np.full(m, np.nan)
+    matches = Matches.of_rays(offsets, bearings1, bearings2, focal_lengths1**-2.0, focal_lengths2**-2.0).of(filled)
     num_rounds = 3
     for _ in range(num_rounds):
-        sigma = _robust_sigmas(matches.of(filled), R[filled], d[filled])
-        R[filled], d[filled] = _levenberg(
-            matches.of(filled), R[filled], d[filled], EFFICIENT_CAUCHY * sigma, -(-num_iterations // num_rounds)
-        )
-    m = len(R)
-    information, median, sigma = np.zeros((m, 5, 5)), np.full(m, np.nan), np.full(m, np.nan)
-    at_work = matches.of(filled)
-    median[filled], sigma[filled] = _medians_and_sigmas(at_work, R[filled], d[filled])
-    information[filled] = _information(at_work, R[filled], d[filled], sigma[filled])
+        scale = EFFICIENT_CAUCHY * _robust_sigmas(matches, R[filled], d[filled])
+        R[filled], d[filled] = _levenberg(matches, R[filled], d[filled], scale, -(-num_iterations // num_rounds))
+    median[filled], sigma[filled] = _medians_and_sigmas(matches, R[filled], d[filled])
+    information[filled] = _information(matches, R[filled], d[filled], sigma[filled])
     return RefinedEdges(R, d, information, median, sigma)
 
 
@@ -139,7 +135,7 @@ def _levenberg(matches: Matches, R: Array, d: Array, scale: Array, num_iteration
 
 def _medians_and_sigmas(matches: Matches, R: Array, d: Array) -> tuple[Array, Array]:
     median = median_errors(matches, R, d)
-    count = np.diff(matches.offsets)
+    count = matches.counts
     return median, MAD_TO_SIGMA * median * np.sqrt(count / np.maximum(count - 5, 1))
 
 
@@ -151,13 +147,12 @@ def _information(matches: Matches, R: Array, d: Array, sigma: Array) -> Array:
     """Inverse covariance in ``(w, tau)``: ``(J^T W J / mean w) (mean psi')^2 / mean psi^2``, (m, 5, 5)."""
     scale = EFFICIENT_CAUCHY * np.maximum(sigma, _MIN_SIGMA_PX)
     hessian = normal_equations(matches, R, d, scale).hessians
-    sums = np.empty((3, len(R)))
-    for edges, _, offsets, r in residuals_by_block(matches, R, d):
-        ratio = np.square(r / scale[edges][segment_of_rows(offsets)])
-        weight = 1.0 / (1.0 + ratio)
-        rows = np.stack([weight, (1.0 - ratio) * weight * weight, np.square(r * weight)])
-        sums[:, edges] = segment_totals(offsets, rows)
-    count = np.diff(matches.offsets)
+    offsets, count = matches.pieces.offsets, matches.counts
+    ratio = np.square(residuals(matches, R, d) / np.repeat(scale, count))
+    weight = 1.0 / (1.0 + ratio)
+    rows = np.stack([weight, (1.0 - ratio) * weight * weight, ratio * weight * weight], axis=1)
+    sums = segment_sums(offsets, rows).T
+    sums[2] *= np.square(scale)
     mean_weight, mean_slope = sums[0] / count, np.maximum(sums[1] / count, 0.1)
     squared_psi = sums[2] / np.maximum(count - 5, 1)
     variance = np.maximum(squared_psi / np.square(mean_slope), _MIN_SIGMA_PX**2)

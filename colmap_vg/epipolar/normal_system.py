@@ -107,7 +107,7 @@ class NormalSystem:
         if len(self.free):
             matrix = self._bordered(matrix, terms, damping)
         try:
-            return -factorize(matrix, in_loop=True).solve(gradient)
+            return -factorize(matrix).solve(gradient)
         except SingularMatrixError:
             return None
 

@@ -1,17 +1,18 @@
 """What an epipolar adjustment works on: the matches of part of a graph, and which focal lengths are free."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletRays
-from colmap_vg.epipolar.sampson import Matches
+from colmap_vg.epipolar.pieces import Pieces
+from colmap_vg.epipolar.sampson import Matches, cut_rays
 from colmap_vg.epipolar.triplets import Triplets, find_triplets
-from colmap_vg.geometry.directions import normalized
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.options import SolveOptions
-from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows
+from colmap_vg.two_view.segments import rows_of_segments
 from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
@@ -53,31 +54,26 @@ class EpipolarProblem:
     keypoints1: NDArray[np.int32] | None = None
     keypoints2: NDArray[np.int32] | None = None
 
+    @cached_property
+    def _pieces(self) -> Pieces:
+        return cut_rays(self.offsets, self.bearings1, self.bearings2)
+
     def matches(self, log_scales: Array) -> Matches:
         """Bearings and pixel variances at logarithms (c,) of factors on the focal lengths."""
-        camera = self.camera_idx[self.edges]
+        camera = self.camera_idx[self.edges].T
         focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
-        rays = [self.bearings1, self.bearings2]
-        if self.free_focals.any():
-            edge = segment_of_rows(self.offsets)
-            rays = [
-                normalized(x * np.stack([shrink, shrink, np.ones(len(x))], axis=1))
-                for x, shrink in zip(rays, np.exp(-log_scales[camera]).T[:, edge], strict=True)
-            ]
-        return Matches(self.offsets, rays[0], rays[1], focal[:, 0] ** -2.0, focal[:, 1] ** -2.0)
+        return Matches(self._pieces, focal**-2.0, np.exp(-log_scales[camera]) if self.free_focals.any() else None)
 
     def without(self, dropped: BoolArray) -> "EpipolarProblem":
         """The same without some edges."""
-        matches = Matches(self.offsets, self.bearings1, self.bearings2, *np.zeros((2, len(self.edges))))
-        kept = matches.of(np.flatnonzero(~dropped))
-        rows = np.repeat(~dropped, np.diff(self.offsets))
+        rows, offsets = rows_of_segments(self.offsets, np.flatnonzero(~dropped))
         triplets = None if self.triplets is None else self.triplets.without(dropped)
         return replace(
             self,
             edges=self.edges[~dropped],
-            offsets=kept.offsets,
-            bearings1=kept.bearings1,
-            bearings2=kept.bearings2,
+            offsets=offsets,
+            bearings1=self.bearings1[rows],
+            bearings2=self.bearings2[rows],
             triplets=None if triplets is None or len(triplets.images) == 0 else triplets,
             keypoints1=None if self.keypoints1 is None else self.keypoints1[rows],
             keypoints2=None if self.keypoints2 is None else self.keypoints2[rows],
@@ -87,12 +83,8 @@ class EpipolarProblem:
         """Rays and pixel variances of triplets at logarithms (c,) of factors on the focal lengths."""
         camera = self.camera_idx[triplets.images].T
         focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
-        rays = triplets.bearings
-        if self.free_focals.any():
-            shrink = np.exp(-log_scales[camera])[:, segment_of_rows(triplets.offsets)]
-            rays = rays * np.stack([shrink, shrink, np.ones(shrink.shape)], axis=1)
-            rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        return TripletRays(triplets.offsets, rays, focal**-2.0)
+        shrinks = np.exp(-log_scales[camera]) if self.free_focals.any() else None
+        return TripletRays(triplets.pieces, focal**-2.0, shrinks)
 
 
 def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) -> EpipolarProblem | None:

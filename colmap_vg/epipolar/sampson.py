@@ -16,14 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.epipolar.pieces import Block, Pieces, shrunk
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
-from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows, segment_quantiles
+from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-_ROWS_PER_BLOCK = 32_768  # matches; the columns of one block stay in the second-level cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,37 +31,53 @@ class Matches:
 
     Attributes
     ----------
-    offsets : (m + 1,) int64 array
-        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``.
-    bearings1, bearings2 : (k, 3) array
-        Unit rays.
-    variances1, variances2 : (m,) array
-        ``1 / f^2``, squared radians per squared pixel.
+    pieces : Pieces
+        Unit rays in image 1 and image 2, six columns.
+    variances : (2, m) array
+        ``1 / f^2`` of camera 1 and 2, squared radians per squared pixel.
+    shrinks : (2, m) array or None
+        Factors on the first two coordinates of the rays, which are then normalised: those of a longer focal length.
     """
 
-    offsets: IntArray
-    bearings1: Array
-    bearings2: Array
-    variances1: Array
-    variances2: Array
+    pieces: Pieces
+    variances: Array
+    shrinks: Array | None = None
+
+    @classmethod
+    def of_rays(
+        cls, offsets: IntArray, bearings1: Array, bearings2: Array, variances1: Array, variances2: Array
+    ) -> "Matches":
+        """From unit rays (k, 3) of matches, those of edge k in rows ``offsets[k]:offsets[k + 1]``."""
+        return cls(cut_rays(offsets, bearings1, bearings2), np.stack([variances1, variances2]))
+
+    @property
+    def counts(self) -> IntArray:
+        """Matches of each edge: (m,)."""
+        return np.diff(self.pieces.offsets)
 
     def of(self, edges: IntArray) -> "Matches":
         """The matches of some edges, in their order."""
-        if len(edges) == len(self.offsets) - 1:
-            return self
-        rows, offsets = rows_of_segments(self.offsets, edges)
-        return Matches(
-            offsets, self.bearings1[rows], self.bearings2[rows], self.variances1[edges], self.variances2[edges]
-        )
+        shrinks = None if self.shrinks is None else self.shrinks[:, edges]
+        return Matches(self.pieces.of(edges), self.variances[:, edges], shrinks)
+
+
+def cut_rays(offsets: IntArray, bearings1: Array, bearings2: Array) -> Pieces:
+    """Pieces of matches' rays (k, 3) in image 1 and image 2."""
+    return Pieces.cut(offsets, [*bearings1.T, *bearings2.T])
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Robust cost (m,), gradient (m, b) and Gauss-Newton Hessian (m, b, b) of each edge, squared pixels."""
+    """Robust cost (m,), gradient (m, b) and Gauss-Newton Hessian (m, b, b) of each edge, squared pixels.
+
+    `slopes` (m,) are sums of the influence function's slopes over sums of weights. The Hessian is that of reweighted
+    least squares, by the weights; Newton's method goes by the slopes, and steps twice as far under plain noise.
+    """
 
     costs: Array
     gradients: Array
     hessians: Array
+    slopes: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,84 +110,90 @@ def moved(R: Array, d: Array, step: Array) -> tuple[Array, Array]:
 
 def cauchy_costs(matches: Matches, R: Array, d: Array, scales: Array) -> Array:
     """``sum s^2 log(1 + r^2 / s^2)`` of each edge, with its scale s (m,) in pixels: (m,)."""
-    costs = np.zeros(len(R))
-    for edges, _, offsets, r in residuals_by_block(matches, R, d):
-        squared_scale = np.square(scales[edges])[segment_of_rows(offsets)]
-        costs[edges] = segment_totals(offsets, squared_scale * np.log1p(r * r / squared_scale))
-    return costs
+    costs, squared_scales = np.zeros(len(R)), np.square(scales)
+    for block, at in _by_block(matches, R, d):
+        ratio = at.r * at.r / squared_scales[at.edge][:, None]
+        costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
+    return costs * squared_scales
 
 
 def median_errors(matches: Matches, R: Array, d: Array) -> Array:
     """Median absolute Sampson error of each edge in pixels, NaN without matches: (m,)."""
-    medians = np.full(len(R), np.nan)
-    for edges, _, offsets, r in residuals_by_block(matches, R, d):
-        medians[edges] = segment_quantiles(offsets, np.abs(r))
-    return medians
+    return segment_quantiles(matches.pieces.offsets, np.abs(residuals(matches, R, d)))
 
 
 def normal_equations(
     matches: Matches, R: Array, d: Array, scales: Array, *, with_focals: bool = False
 ) -> NormalEquations:
     """Cauchy costs and their normal equations by (w, tau), b = 5, and the two log focal lengths where asked, b = 7."""
-    m, b = len(R), 7 if with_focals else 5
-    upper = np.triu_indices(b)
-    costs, gradients, hessians = np.zeros(m), np.zeros((m, b)), np.zeros((m, b, b))
-    for edges, rows, offsets in _blocks(matches):
-        at = _at_frames(matches, R, d, edges, rows, offsets)
-        squared_scale = np.square(scales[edges])[segment_of_rows(offsets)]
-        ratio = at.r * at.r / squared_scale
-        J = _jacobian(at, with_focals)
-        weighted = J / (1.0 + ratio)
-        costs[edges] = segment_totals(offsets, squared_scale * np.log1p(ratio))
-        gradients[edges] = segment_totals(offsets, weighted * at.r).T
-        totals = segment_totals(offsets, weighted[upper[0]] * J[upper[1]]).T
-        block = hessians[edges]
-        block[:, upper[0], upper[1]] = totals
-        block[:, upper[1], upper[0]] = totals
-    return NormalEquations(costs, gradients, hessians)
+    m, b, squared_scales = len(R), 7 if with_focals else 5, np.square(scales)
+    costs, products, slopes = np.zeros(m), np.zeros((m, b, b + 1)), np.ones(m)
+    for block, at in _by_block(matches, R, d):
+        ratio = at.r * at.r / squared_scales[at.edge][:, None]
+        columns = _jacobian_and_residuals(at, with_focals)
+        weights = 1.0 / (1.0 + ratio)
+        slopes[block.segments] = _mean_slopes(matches.pieces, block, weights)
+        weighted = columns[:, :b] * weights[:, None]
+        costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
+        products[block.segments] = block.totals(weighted @ np.swapaxes(columns, 1, 2))
+    hessians = products[:, :, :b]
+    # Both triangles were summed; their last digits differ.
+    hessians = 0.5 * (hessians + np.swapaxes(hessians, 1, 2))
+    return NormalEquations(costs * squared_scales, products[:, :, b], hessians, slopes)
 
 
-def residuals_by_block(matches: Matches, R: Array, d: Array) -> Iterator[tuple[slice, slice, IntArray, Array]]:
-    """Runs of whole edges: their slice, their rows' slice, offsets from the first row, residuals in pixels."""
-    for edges, rows, offsets in _blocks(matches):
-        yield edges, rows, offsets, _at_frames(matches, R, d, edges, rows, offsets).r
+def _mean_slopes(pieces: Pieces, block: Block, weights: Array) -> Array:
+    """Sum of ``psi' = w (2 w - 1)`` over that of Cauchy's weights w (pieces, length) of each segment: (m,)."""
+    padding = weights.shape[1] - pieces.counts[block.pieces]  # of weight one
+    sums = np.stack([weights.sum(axis=1), np.square(weights).sum(axis=1)], axis=1) - padding[:, None]
+    first, second = block.totals(sums).T
+    return np.asarray(2.0 * second / np.maximum(first, 1e-300) - 1.0)
+
+
+def residuals(matches: Matches, R: Array, d: Array) -> Array:
+    """Sampson errors of all matches in pixels, in the order of their rows: (k,)."""
+    parts = [matches.pieces.rows(at.r, block) for block, at in _by_block(matches, R, d)]
+    return np.concatenate([np.zeros(0), *parts])
 
 
 def derivatives_by_block(
     matches: Matches, R: Array, d: Array, *, with_focals: bool = False
 ) -> Iterator[tuple[slice, slice, IntArray, "SampsonDerivatives"]]:
-    """Runs of whole edges as `residuals_by_block`, with the residuals' derivatives by poses and by keypoints."""
-    for edges, rows, offsets in _blocks(matches):
-        at = _at_frames(matches, R, d, edges, rows, offsets)
-        edge = segment_of_rows(offsets)
-        Q1, Q2 = frames(R[edges], d[edges])
+    """Runs of whole edges: their slice, their rows' slice, offsets from the first row, and derivatives."""
+    pieces = matches.pieces
+    for block, at in _by_block(matches, R, d):
         rays = []
-        sides = ((Q1, -at.z[1], at.z[0], matches.bearings1, at.v1), (Q2, at.y[1], -at.y[0], matches.bearings2, at.v2))
-        for Q, first, second, bearings, v in sides:
-            line = np.stack([Q[:, a, 0][edge] * first + Q[:, a, 1][edge] * second for a in range(3)])
-            rays.append((line - at.c * bearings[rows].T) * np.sqrt(v / at.variance))
-        yield edges, rows, offsets, SampsonDerivatives(at.r, _jacobian(at, with_focals), rays[0], rays[1])
-
-
-def segment_totals(offsets: IntArray, values: Array) -> Array:
-    """Sums over segments along the last axis, zero for empty ones: (..., k) to (..., m)."""
-    filled = np.flatnonzero(np.diff(offsets) > 0)
-    totals = np.zeros((*values.shape[:-1], len(offsets) - 1))
-    if len(filled):
-        totals[..., filled] = np.add.reduceat(values, offsets[:-1][filled], axis=-1)
-    return totals
+        for Q, x, first, second, v in (
+            (at.Q1, at.x1, -at.z[1], at.z[0], at.v1),
+            (at.Q2, at.x2, at.y[1], -at.y[0], at.v2),
+        ):
+            line = np.stack([Q[:, a, 0, None] * first + Q[:, a, 1, None] * second for a in range(3)])
+            rays.append(pieces.rows((line - at.c * np.moveaxis(x, 1, 0)) * np.sqrt(v / at.variance), block))
+        by_pose = np.moveaxis(_jacobian_and_residuals(at, with_focals)[:, :-1], 1, 0)
+        offsets = pieces.offsets[block.segments.start : block.segments.stop + 1]
+        yield (
+            block.segments,
+            slice(int(offsets[0]), int(offsets[-1])),
+            offsets - offsets[0],
+            SampsonDerivatives(pieces.rows(at.r, block), pieces.rows(by_pose, block), rays[0], rays[1]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class _AtFrames:
-    """Coordinates of a block's matches in their edges' frames, and what is made of them; lists of (k,) arrays."""
+    """Coordinates of a block's matches in their edges' frames, and what is made of them.
 
-    y: list[Array]
-    z: list[Array]
-    axis1: list[Array]
-    axis2: list[Array]
-    depth1: Array
-    depth2: Array
+    Of each match (pieces, length), with rays x as (pieces, 3, length) and turned ones y and z as (3, pieces, length);
+    of each piece its edge (pieces,), frames (pieces, 3, 3) and variances (pieces, 1).
+    """
+
+    edge: IntArray
+    Q1: Array
+    Q2: Array
+    x1: Array
+    x2: Array
+    y: Array
+    z: Array
     v1: Array
     v2: Array
     c: Array
@@ -180,50 +201,54 @@ class _AtFrames:
     r: Array
 
 
-def _at_frames(matches: Matches, R: Array, d: Array, edges: slice, rows: slice, offsets: IntArray) -> _AtFrames:
-    edge = segment_of_rows(offsets)
-    Q1, Q2 = frames(R[edges], d[edges])
-    x1, x2 = matches.bearings1[rows].T, matches.bearings2[rows].T
-    y = [sum((Q1[:, a, b][edge] * x1[a] for a in range(3)), start=np.zeros(len(edge))) for b in range(3)]
-    z = [sum((Q2[:, a, b][edge] * x2[a] for a in range(3)), start=np.zeros(len(edge))) for b in range(3)]
-    v1, v2 = matches.variances1[edges][edge], matches.variances2[edges][edge]
+def _by_block(matches: Matches, R: Array, d: Array) -> Iterator[tuple[Block, _AtFrames]]:
+    Q1, Q2 = frames(R, d)
+    for block in matches.pieces.blocks():
+        yield block, _at_frames(matches, Q1, Q2, block)
+
+
+def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -> _AtFrames:
+    edge = matches.pieces.segments[block.pieces]
+    Q1, Q2 = frames1[edge], frames2[edge]
+    columns = matches.pieces.columns[block.pieces]
+    x1, x2 = columns[:, :3], columns[:, 3:]
+    if matches.shrinks is not None:
+        x1, x2 = (shrunk(x, factor[edge]) for x, factor in zip((x1, x2), matches.shrinks, strict=True))
+    y, z = (np.moveaxis(np.swapaxes(Q, 1, 2) @ x, 1, 0) for Q, x in ((Q1, x1), (Q2, x2)))
+    v1, v2 = matches.variances[:, edge, None]
     c = z[0] * y[1] - z[1] * y[0]
     squared = c * c
     # 1 - y_3^2 without cancellation near the epipole; the floor keeps a match on both epipoles finite.
     variance = (y[0] * y[0] + y[1] * y[1] - squared) * v2 + (z[0] * z[0] + z[1] * z[1] - squared) * v1
-    variance = np.maximum(variance, 1e-12 * (v1 + v2))
-    axis1, axis2 = ([Q[:, 2, b][edge] for b in range(2)] for Q in (Q1, Q2))
-    return _AtFrames(y, z, axis1, axis2, x1[2], x2[2], v1, v2, c, variance, c / np.sqrt(variance))
+    np.maximum(variance, 1e-12 * (v1 + v2), out=variance)
+    return _AtFrames(edge, Q1, Q2, x1, x2, y, z, v1, v2, c, variance, c / np.sqrt(variance))
 
 
-def _jacobian(at: _AtFrames, with_focals: bool) -> Array:
-    """Derivatives of the residuals: (5, k), or (7, k) with the focal lengths."""
-    y, z, v1, v2, c = at.y, at.z, at.v1, at.v2, at.c
-    slope = np.empty((7 if with_focals else 5, len(c)))
-    slope[0], slope[1], slope[2] = -y[0] * z[2], -y[1] * z[2], y[0] * z[0] + y[1] * z[1]
-    slope[3], slope[4] = z[1] * y[2] - z[2] * y[1], z[2] * y[0] - z[0] * y[2]
+def _jacobian_and_residuals(at: _AtFrames, with_focals: bool) -> Array:
+    """Derivatives of the residuals, 5 or with the focal lengths 7, and the residuals: (pieces, 6 or 8, length).
+
+    With ``c'`` the slope of the constraint and ``h + c c' (-v_1 - v_2)`` half that of s^2:
+    ``r' = c' (1 / s + r c (v_1 + v_2) / s^2) - h r / s^2``.
+    """
+    y, z, c = at.y, at.z, at.c
+    bend = at.r / at.variance
+    gain = 1.0 / np.sqrt(at.variance) + bend * c * (at.v1 + at.v2)
+    bend1, bend2 = bend * at.v1, bend * at.v2
+    along1, along2 = bend2 * y[2], bend1 * z[2]
+    J = np.empty((len(c), 8 if with_focals else 6, c.shape[1]))
+    J[:, 0] = -gain * y[0] * z[2] - along2 * z[1]
+    J[:, 1] = along2 * z[0] - gain * y[1] * z[2]
+    J[:, 2] = gain * (y[0] * z[0] + y[1] * z[1])
+    J[:, 3] = gain * (z[1] * y[2] - z[2] * y[1]) + along1 * y[0] + along2 * z[0]
+    J[:, 4] = gain * (z[2] * y[0] - z[0] * y[2]) + along1 * y[1] + along2 * z[1]
     if with_focals:
-        dy = [at.depth1 * (at.axis1[b] - at.depth1 * y[b]) for b in range(2)]
-        dz = [at.depth2 * (at.axis2[b] - at.depth2 * z[b]) for b in range(2)]
-        slope[5], slope[6] = z[0] * dy[1] - z[1] * dy[0], dz[0] * y[1] - dz[1] * y[0]
-    half = -c * (v1 + v2) * slope  # half the derivative of s^2
-    half[0] += z[2] * z[1] * v1
-    half[1] -= z[2] * z[0] * v1
-    half[3] -= y[2] * y[0] * v2 + z[2] * z[0] * v1
-    half[4] -= y[2] * y[1] * v2 + z[2] * z[1] * v1
-    if with_focals:
+        depth1, depth2 = at.x1[:, 2], at.x2[:, 2]
+        dy = [depth1 * (at.Q1[:, 2, b, None] - depth1 * y[b]) for b in range(2)]
+        dz = [depth2 * (at.Q2[:, 2, b, None] - depth2 * z[b]) for b in range(2)]
         squared = c * c
-        half[5] += (y[0] * dy[0] + y[1] * dy[1]) * v2 - (z[0] * z[0] + z[1] * z[1] - squared) * v1
-        half[6] += (z[0] * dz[0] + z[1] * dz[1]) * v1 - (y[0] * y[0] + y[1] * y[1] - squared) * v2
-    return np.asarray(slope / np.sqrt(at.variance) - (at.r / at.variance) * half)
-
-
-def _blocks(matches: Matches) -> Iterator[tuple[slice, slice, IntArray]]:
-    """Runs of whole edges of about `_ROWS_PER_BLOCK` rows: edges, rows, and offsets from the first row."""
-    offsets = matches.offsets
-    first, last = 0, len(offsets) - 1
-    while first < last:
-        stop = int(np.searchsorted(offsets, offsets[first] + _ROWS_PER_BLOCK, side="right")) - 1
-        stop = min(max(stop, first + 1), last)
-        yield slice(first, stop), slice(offsets[first], offsets[stop]), offsets[first : stop + 1] - offsets[first]
-        first = stop
+        J[:, 5] = gain * (z[0] * dy[1] - z[1] * dy[0])
+        J[:, 5] -= (y[0] * dy[0] + y[1] * dy[1]) * bend2 - (z[0] * z[0] + z[1] * z[1] - squared) * bend1
+        J[:, 6] = gain * (dz[0] * y[1] - dz[1] * y[0])
+        J[:, 6] -= (z[0] * dz[0] + z[1] * dz[1]) * bend1 - (y[0] * y[0] + y[1] * y[1] - squared) * bend2
+    J[:, -1] = at.r
+    return J

@@ -6,11 +6,13 @@ theta the angles between the rays of a point: the information on the ratio grows
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from colmap_vg.epipolar.pieces import Pieces
 from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_of_rows, segment_subset, segment_sums
 
 Array = NDArray[np.float64]
@@ -48,6 +50,11 @@ class Triplets:
     offsets: IntArray
     bearings: Array
     keypoints: IntArray
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """The rays' nine columns."""
+        return Pieces.cut(self.offsets, list(self.bearings.reshape(9, -1)))
 
     def without(self, dropped: BoolArray) -> "Triplets":
         """The same without those that use a dropped edge (m,), the edges left numbered anew."""

@@ -85,7 +85,7 @@ class ReweightedLaplacian:
             x = conjugate_gradients(A, b, self._factor, relative_tolerance, self._max_cg_iterations)
         if x is None:
             self._factor = None  # frees the old factor before the new one is made
-            self._factor = factorize(A, in_loop=True)
+            self._factor = factorize(A)
             x = self._factor.solve(b)
         return np.asarray(x - x.mean(axis=0))
 

@@ -1,7 +1,8 @@
 """One adapter to direct solvers for symmetric positive definite systems.
 
 scipy's SuperLU is set up for such matrices (minimum degree on A + A^T, no pivoting off the diagonal), which is three to
-four times faster than its default on viewing graphs. Where the matrix is small or nearly full, LAPACK's Cholesky wins.
+four times faster than its default on viewing graphs. Where the matrix is tiny, or large and nearly full, LAPACK's
+Cholesky wins.
 """
 
 from typing import Protocol
@@ -16,14 +17,13 @@ from colmap_vg.errors import GraphError
 
 Array = NDArray[np.float64]
 
-DENSE_BELOW = 600
-"""Up to this many unknowns LAPACK is faster than building a sparse factor (measured on ring and random graphs)."""
-DENSE_BELOW_IN_LOOP = 64
-"""Below this LAPACK does not start threads. On a busy machine with two cores a Cholesky factor of 282 unknowns took
-130 to 410 ms with them, 0.3 ms without, and SuperLU 0.9 ms either way."""
+DENSE_BELOW = 64
+"""Below this LAPACK does not start threads, which on a busy machine wait for each other: with two cores a Cholesky
+factor of 138 unknowns took 0.2 to 290 ms with them, one of 600 took 3 to 1,440 ms; SuperLU 0.5 and 29 ms."""
+DENSE_FROM, DENSE_LIMIT = 2_000, 12_000
+"""Unknowns between which LAPACK is faster than SuperLU, even if its threads wait, where the matrix is nearly full."""
 DENSE_FILL = 0.1
-"""From this share of nonzeros on, up to `DENSE_FILL_LIMIT` unknowns, LAPACK is faster than SuperLU."""
-DENSE_FILL_LIMIT = 12_000
+"""Share of nonzeros from which on a matrix counts as nearly full."""
 
 
 class Factor(Protocol):
@@ -66,7 +66,7 @@ class SingularMatrixError(GraphError):
     """The system is singular: part of the graph is not fixed by its edges."""
 
 
-def factorize(matrix: sp.csc_array, *, check_definite: bool = False, in_loop: bool = False) -> Factor:
+def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
     """Factor a sparse symmetric positive definite matrix.
 
     Parameters
@@ -75,9 +75,6 @@ def factorize(matrix: sp.csc_array, *, check_definite: bool = False, in_loop: bo
         Both triangles stored.
     check_definite : bool
         Refuse indefinite matrices on the sparse path too, at the cost of a copy of the factor.
-    in_loop : bool
-        The factor is one of many: SuperLU above `DENSE_BELOW_IN_LOOP` whatever the fill. LAPACK's threads wait
-        for each other at every call, which on a busy machine cost eight times SuperLU's time (627 full rows).
 
     Returns
     -------
@@ -90,8 +87,6 @@ def factorize(matrix: sp.csc_array, *, check_definite: bool = False, in_loop: bo
     """
     n = matrix.shape[0]
     fill = matrix.nnz / max(1, n * n)
-    if n <= (DENSE_BELOW_IN_LOOP if in_loop else DENSE_BELOW) or (
-        not in_loop and fill >= DENSE_FILL and n <= DENSE_FILL_LIMIT
-    ):
+    if n <= DENSE_BELOW or (fill >= DENSE_FILL and DENSE_FROM <= n <= DENSE_LIMIT):
         return _CholeskyFactor(matrix.toarray())
     return _SuperLUFactor(matrix, check_definite)

@@ -127,7 +127,7 @@ class _SmallestVector:
     def find(self, H: Array) -> Array:
         matrix = self._pattern.assemble(H, H, -H)
         damping = DAMPING * float(matrix.diagonal().mean()) * np.tile(np.eye(3), (self._n, 1, 1))
-        factor = factorize(self._pattern.assemble(H, H, -H, damping), in_loop=True)
+        factor = factorize(self._pattern.assemble(H, H, -H, damping))
         V = np.linalg.qr(self._vectors)[0]
         best, change = V[:, 0], np.inf
         for _ in range(MAX_SOLVES):

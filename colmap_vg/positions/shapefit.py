@@ -170,7 +170,7 @@ class _ShapeFit:
         level = DAMPING * stiffness[:, None, None] * np.eye(3)
         while True:
             try:
-                return factorize(self._pattern.assemble(H, H, -H, level), in_loop=True)
+                return factorize(self._pattern.assemble(H, H, -H, level))
             except SingularMatrixError:  # weights that differ by many orders: rounding eats the damping
                 level = 10.0 * level
 

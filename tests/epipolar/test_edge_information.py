@@ -75,7 +75,7 @@ def test_minimum_is_the_one_that_scipy_finds():
 
 def test_derivatives_are_those_of_finite_differences():
     data = matched_rays(2, [10, 12], sigma=0.02)
-    matches = sampson.Matches(
+    matches = sampson.Matches.of_rays(
         data.offsets, data.bearings1, data.bearings2, np.array([900.0, 800]) ** -2, np.array([400.0, 500]) ** -2
     )
 
