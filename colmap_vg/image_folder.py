@@ -5,7 +5,6 @@ the output folder is never half made. ``OUT/.work/features.json`` says from what
 """
 
 import json
-import shutil
 import sqlite3
 from collections.abc import Callable
 from dataclasses import asdict
@@ -14,10 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_vg.errors import OutputError
-from colmap_vg.features.extraction import FeatureResult, check_photographs, extract_features, match_features
+from colmap_vg.features.extraction import UNREADABLE, FeatureResult, check_photographs
+from colmap_vg.features.isolated import extract_features_apart, match_features_apart
+from colmap_vg.features.photographs import SkippedFile
 from colmap_vg.mapper import view_graph_mapping
 from colmap_vg.options import FeatureOptions, MappingOptions
-from colmap_vg.output_folder import WORK_NAME, prepare_output, refuse_models
+from colmap_vg.output_folder import WORK_NAME, lock_descriptors, output_lock, refuse_models, work_folder
 from colmap_vg.stages import StageEvent, StageLog
 
 if TYPE_CHECKING:
@@ -59,9 +60,10 @@ def image_folder_mapping(
         The folder or its photographs cannot be used, the output cannot be written, or no model could be made.
     """
     options = options or MappingOptions()
-    make_database(image_path, output_path, features, StageLog(on_event), overwrite=options.overwrite)
-    database_path = Path(output_path) / DATABASE_NAME
-    return view_graph_mapping(database_path, image_path, output_path, options, on_event=on_event)
+    with output_lock(output_path):
+        make_database(image_path, output_path, features, StageLog(on_event), overwrite=options.overwrite)
+        database_path = Path(output_path) / DATABASE_NAME
+        return view_graph_mapping(database_path, image_path, output_path, options, on_event=on_event)
 
 
 def make_database(
@@ -98,36 +100,49 @@ def make_database(
         The output cannot be written, or holds models, or a database made by something else.
     """
     options, log = options or FeatureOptions(), log or StageLog()
-    finished, work = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME
-    record_path, unfinished = work / RECORD_NAME, work / DATABASE_NAME
     refuse_models(output_path, overwrite)
+    finished, record_path = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME / RECORD_NAME
     if finished.exists() and not record_path.exists() and not overwrite:
         raise OutputError(
             f"{finished} is there already, and colmap-vg did not make it here: map it with "
             f"`colmap-vg mapper`, choose another --output_path, or replace it with --overwrite"
         )
     names, skipped = check_photographs(image_path, options, log)
-    prepare_output(output_path, overwrite)
-    record = _record(image_path, names, options)
-    same = resume and _read_record(record_path) == record
-    if same and finished.exists():
-        log.progress(f"reusing {finished}")
-        known = set(image_names(finished))
-        return FeatureResult(tuple(name for name in names if name in known), tuple(skipped), _num_verified(finished))
-    if resume and record_path.exists() and not same:
-        log.warn(f"{work} was made from other photographs or with other options: features are extracted afresh")
-    try:
+    with work_folder(output_path, overwrite) as work:
+        record, unfinished = _record(image_path, names, options), work / DATABASE_NAME
+        same = resume and _read_record(record_path) == record
+        if same and finished.exists():
+            log.progress(f"reusing {finished}")
+            known = set(image_names(finished))
+            skipped += [SkippedFile(name, UNREADABLE) for name in names if name not in known]
+            readable = tuple(name for name in names if name in known)
+            return FeatureResult(readable, tuple(skipped), _num_verified(finished))
+        if resume and record_path.exists() and not same:
+            log.warn(f"{work} was made from other photographs or with other options: features are extracted afresh")
         if not same:
-            shutil.rmtree(work, ignore_errors=True)
-            finished.unlink(missing_ok=True)
-        work.mkdir(parents=True, exist_ok=True)
-        record_path.write_text(json.dumps(record, indent=1), encoding="utf-8")
+            _start_afresh(finished, unfinished, record_path, record)
+        names, unreadable = extract_features_apart(image_path, unfinished, names, options, log, lock_descriptors())
+        num_verified_pairs = match_features_apart(unfinished, options, log, lock_descriptors())
+        try:
+            unfinished.replace(finished)
+        except OSError as error:
+            raise OutputError(f"cannot write {finished}: {error.strerror}; choose another --output_path") from error
+        return FeatureResult(tuple(names), (*skipped, *unreadable), num_verified_pairs)
+
+
+def _start_afresh(finished: Path, unfinished: Path, record_path: Path, record: dict[str, object]) -> None:
+    """Remove what an earlier job made, its record first: a job killed in between leaves nothing that seems whole."""
+    try:
+        record_path.unlink(missing_ok=True)
+        for path in (finished, *unfinished.parent.glob(f"{DATABASE_NAME}*")):
+            path.unlink(missing_ok=True)
+        written = record_path.with_suffix(".new")
+        written.write_text(json.dumps(record, indent=1), encoding="utf-8")
+        written.replace(record_path)
     except OSError as error:
-        raise OutputError(f"cannot write to {work}: {error.strerror}; choose another --output_path") from error
-    names, unreadable = extract_features(image_path, unfinished, names, options, log)
-    num_verified_pairs = match_features(unfinished, options, log)
-    unfinished.replace(finished)
-    return FeatureResult(tuple(names), (*skipped, *unreadable), num_verified_pairs)
+        raise OutputError(
+            f"cannot write to {record_path.parent}: {error.strerror}; choose another --output_path"
+        ) from error
 
 
 def _record(image_path: str | PathLike[str], names: list[str], options: FeatureOptions) -> dict[str, object]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.database import check_database
 from colmap_vg.colmap_io.read import read_with_caveats
-from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
+from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
 from colmap_vg.errors import MappingError
 from colmap_vg.ledger import described
@@ -24,7 +24,7 @@ from colmap_vg.mapping.build import (
     extract_colors,
 )
 from colmap_vg.options import MappingOptions
-from colmap_vg.output_folder import publish_models, refuse_models, work_folder
+from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
 from colmap_vg.solve import solve_view_graph
 from colmap_vg.stages import StageEvent, StageLog
@@ -130,13 +130,12 @@ def map_database(
                 " points at an angle that could fix them; add overlapping photographs, taken from different places"
             )
         with log.stage("write"):
-            staged = [work / str(index) for index in range(len(built))]
+            staged = stage_models(work, len(built))
             for folder, model in zip(staged, built, strict=True):
                 model.reconstruction.normalize()
                 if options.extract_colors:
                     extract_colors(model.reconstruction, image_path, log)
-                folder.mkdir(exist_ok=True)
-                model.reconstruction.write(folder)
+                write_model(model.reconstruction, folder)
             published = publish_models(staged, output_path)
             log.result(", ".join(map(str, published)))
     models = {index: model.reconstruction for index, model in enumerate(built)}

@@ -1,19 +1,31 @@
-"""The output folder: checked before work starts, and given whole models only.
+"""The output folder: locked and checked before work starts, and given whole models only.
 
 Models are written under ``OUT/.work`` and renamed to ``OUT/0``, ``OUT/1``, ...: a killed job leaves no half model.
 """
 
+import errno
+import fcntl
+import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from os import PathLike
 from pathlib import Path
 
 from colmap_vg.errors import OutputError
 
 WORK_NAME = ".work"
+LOCK_NAME = "lock"
+STAGE_NAME = "models"
+LOCK_PATIENCE = 3.0
+"""Seconds to wait for another job's lock: a job that was killed may have a process that is about to end."""
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""What file systems that know no locks answer."""
+_held: ContextVar[Mapping[Path, int]] = ContextVar("_held", default={})  # noqa: B039  -- never changed, only replaced
 _MODEL_NAME = re.compile(r"\d+")
 _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 
@@ -45,19 +57,45 @@ def prepare_output(output_path: str | PathLike[str], overwrite: bool = False) ->
         with tempfile.TemporaryFile(dir=work) as probe:
             probe.write(b"\0")
     except OSError as error:
-        raise OutputError(
-            f"cannot write to the output folder {output}: {error.strerror}; choose another --output_path"
-        ) from error
+        raise _not_writable(output, error.strerror) from error
     return work
 
 
 @contextmanager
 def work_folder(output_path: str | PathLike[str], overwrite: bool = False) -> Iterator[Path]:
-    """As :func:`prepare_output`; when the job fails, folders that it made and that hold nothing go again."""
-    work = Path(output_path) / WORK_NAME
+    """As :func:`prepare_output`, under the folder's lock: see :func:`output_lock`."""
+    with output_lock(output_path):
+        yield prepare_output(output_path, overwrite)
+
+
+@contextmanager
+def output_lock(output_path: str | PathLike[str]) -> Iterator[None]:
+    """Keep other jobs off an output folder; the kernel lets go of the lock however this process ends.
+
+    A job that holds the lock may ask for it again. When the job fails, folders that were made for it and that hold
+    nothing go again.
+
+    Raises
+    ------
+    OutputError
+        Another job works in the folder, or it cannot be written.
+    """
+    work = Path(output_path).absolute() / WORK_NAME
+    key = work.parent.resolve()
+    if key in _held.get():
+        yield
+        return
     made = [path for path in (work, *work.parents) if not path.exists()]
     try:
-        yield prepare_output(output_path, overwrite)
+        descriptor = _locked_file(work / LOCK_NAME, output_path)
+        token = _held.set({**_held.get(), key: descriptor})
+        try:
+            yield
+        finally:
+            _held.reset(token)
+            with suppress(OSError):
+                (work / LOCK_NAME).unlink()
+            os.close(descriptor)
     except BaseException:
         for path in made:
             with suppress(OSError):
@@ -65,9 +103,66 @@ def work_folder(output_path: str | PathLike[str], overwrite: bool = False) -> It
         raise
 
 
+def lock_descriptors() -> tuple[int, ...]:
+    """File descriptors of the locks that this job holds: a process that inherits them keeps the lock until it ends."""
+    return tuple(_held.get().values())
+
+
+def _locked_file(path: Path, output_path: str | PathLike[str]) -> int:
+    """Descriptor of the lock file, locked, with this process's number in it."""
+    deadline = time.monotonic() + LOCK_PATIENCE
+    while True:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except FileNotFoundError:
+            if time.monotonic() < deadline:
+                continue  # the other job has just removed the folder that it had made
+            raise _not_writable(output_path, "its work folder goes as it is made") from None
+        except OSError as error:
+            raise _not_writable(output_path, error.strerror) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            other = os.pread(descriptor, 32, 0).decode("ascii", errors="replace").strip()
+            os.close(descriptor)
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, *_NO_LOCKS):
+                raise _not_writable(output_path, error.strerror) from error
+            if error.errno in _NO_LOCKS:
+                return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            if time.monotonic() >= deadline:
+                raise OutputError(
+                    f"another job (process {other or 'unknown'}) is at work in {output_path}: wait until it has ended,"
+                    " or choose another --output_path"
+                ) from error
+            time.sleep(0.05)
+            continue
+        # The other job may have removed the file between the two steps above: then this is the lock of nothing.
+        if _inode(path) == os.fstat(descriptor).st_ino:
+            with suppress(OSError):  # on a full disk the lock holds without a number
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, f"{os.getpid()}\n".encode("ascii"), 0)
+            return descriptor
+        os.close(descriptor)
+
+
+def _inode(path: Path) -> int | None:
+    try:
+        return path.stat().st_ino
+    except FileNotFoundError:
+        return None
+
+
+def _not_writable(output_path: str | PathLike[str], why: str | None) -> OutputError:
+    return OutputError(f"cannot write to the output folder {output_path}: {why}; choose another --output_path")
+
+
 def refuse_models(output_path: str | PathLike[str], overwrite: bool = False) -> None:
     """Raise `OutputError` when the folder holds a model that must not be overwritten; nothing is created."""
     models = existing_models(output_path)
+    first = Path(output_path) / "0"
+    if first.exists() and first not in models and not (first.is_dir() and not any(first.iterdir())):
+        raise OutputError(f"{first} is there and is no model: move it, or choose another --output_path")
     if models and not overwrite:
         raise OutputError(
             f"{output_path} already holds a model ({models[0]}): choose another --output_path, or replace it with "
@@ -104,18 +199,41 @@ def publish_models(staged: Sequence[Path], output_path: str | PathLike[str]) -> 
     OutputError
         A folder cannot be renamed.
     """
-    output, work = Path(output_path), Path(output_path) / WORK_NAME
-    replaced = work / "replaced"
+    output, replaced = Path(output_path), Path(output_path) / WORK_NAME / "replaced"
+    moved: list[tuple[Path, Path]] = []
     try:
         shutil.rmtree(replaced, ignore_errors=True)
         replaced.mkdir(parents=True)
-        for path in existing_models(output):
-            if path != output:
-                path.rename(replaced / path.name)
-        published = []
-        for index, path in enumerate(staged):
-            published.append(path.rename(output / str(index)))
-        shutil.rmtree(replaced)
+        old = [(path, replaced / path.name) for path in existing_models(output) if path != output]
+        new = [(path, output / str(index)) for index, path in enumerate(staged)]
+        for source, target in old + new:
+            source.rename(target)
+            moved.append((source, target))
     except OSError as error:
+        with suppress(OSError):
+            for source, target in reversed(moved):
+                target.rename(source)
         raise OutputError(f"cannot put the models into {output}: {error.strerror} ({error.filename})") from error
-    return published
+    shutil.rmtree(replaced, ignore_errors=True)
+    with suppress(OSError):
+        (output / WORK_NAME / STAGE_NAME).rmdir()
+    return [target for _, target in new]
+
+
+def stage_models(work: Path, num_models: int) -> list[Path]:
+    """Empty folders for models, on the output's own file system; what a killed job left there goes.
+
+    Raises
+    ------
+    OutputError
+        They cannot be made.
+    """
+    stage = work / STAGE_NAME
+    folders = [stage / str(index) for index in range(num_models)]
+    try:
+        shutil.rmtree(stage, ignore_errors=True)
+        for folder in folders:
+            folder.mkdir(parents=True)
+    except OSError as error:
+        raise _not_writable(work.parent, error.strerror) from error
+    return folders

@@ -43,7 +43,7 @@ def test_unfinished_database_is_gone_on_with(tmp_path: Path, images: Path, monke
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("colmap_vg.image_folder.match_features", interrupt)
+        patch.setattr("colmap_vg.image_folder.match_features_apart", interrupt)
         with pytest.raises(KeyboardInterrupt):
             make_database(images, tmp_path, OPTIONS)
     assert not (tmp_path / "database.db").exists()

@@ -1,17 +1,19 @@
 """What the verbs do: the library's jobs, with their results shown and written to ``summary.json``."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pycolmap
 
+from colmap_vg.cli.job_record import recorded_job
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.cli.summary import edge_summary, image_summary, job_summary, model_summary, plain, write_summary
 from colmap_vg.errors import MappingError
 from colmap_vg.image_folder import DATABASE_NAME, make_database
 from colmap_vg.mapper import MappingResult, map_database
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
-from colmap_vg.output_folder import publish_models, refuse_models, work_folder
+from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
 from colmap_vg.stages import StageLog
 from colmap_vg.verdict_tables import (
@@ -25,6 +27,8 @@ from colmap_vg.verdict_tables import (
     write_tables,
 )
 from colmap_vg.view_graph import ViewGraph
+
+DONE_BEFORE = "{}: this job came to its end before; nothing is left to do"
 
 
 def configure_colmap_log(verbose: bool) -> None:
@@ -44,12 +48,16 @@ def run(
     """From a folder of photographs to models."""
     configure_colmap_log(reporter.verbose)
     log = StageLog(reporter.on_event)
-    result = make_database(image_path, output_path, features, log, overwrite=options.overwrite, resume=resume)
-    database_path = output_path / DATABASE_NAME
-    mapped = map_database(database_path, image_path, output_path, options, log)
     asked = {"image_path": image_path, "output_path": output_path, "features": features, "mapping": options}
-    skipped = {file.name: file.reason for file in result.skipped}
-    _finish("run", {**asked, "resume": resume}, mapped, output_path, reporter, skipped)
+    with recorded_job(output_path, "run", asked, image_path, overwrite=options.overwrite, resume=resume) as job:
+        if job.finished:
+            reporter.say(DONE_BEFORE.format(output_path))
+            return
+        options = replace(options, overwrite=job.overwrite)
+        result = make_database(image_path, output_path, features, log, overwrite=options.overwrite, resume=resume)
+        mapped = map_database(output_path / DATABASE_NAME, image_path, output_path, options, log)
+        skipped = {file.name: file.reason for file in result.skipped}
+        _finish("run", {**asked, "resume": resume}, mapped, output_path, reporter, skipped)
 
 
 def mapper(
@@ -62,9 +70,14 @@ def mapper(
 ) -> None:
     """From a database to models."""
     configure_colmap_log(reporter.verbose)
-    mapped = map_database(database_path, image_path, output_path, options, StageLog(reporter.on_event))
     asked = {"database_path": database_path, "image_path": image_path, "output_path": output_path, "mapping": options}
-    _finish("mapper", {**asked, "resume": resume}, mapped, output_path, reporter, {})
+    with recorded_job(output_path, "mapper", asked, database_path, overwrite=options.overwrite, resume=resume) as job:
+        if job.finished:
+            reporter.say(DONE_BEFORE.format(output_path))
+            return
+        options = replace(options, overwrite=job.overwrite)
+        mapped = map_database(database_path, image_path, output_path, options, StageLog(reporter.on_event))
+        _finish("mapper", {**asked, "resume": resume}, mapped, output_path, reporter, {})
 
 
 def solve(
@@ -77,12 +90,37 @@ def solve(
     reporter: Reporter,
 ) -> None:
     """The viewing graph only: a model of poses without points."""
+    configure_colmap_log(reporter.verbose)
+    asked = {"database_path": database_path, "output_path": output_path, "read": read, "solve": options}
+    with recorded_job(output_path, "solve", asked, database_path, overwrite=overwrite, resume=resume) as job:
+        if job.finished:
+            reporter.say(DONE_BEFORE.format(output_path))
+            return
+        _solve(
+            database_path,
+            output_path,
+            read,
+            options,
+            job.overwrite,
+            reporter,
+            {**asked, "overwrite": overwrite, "resume": resume},
+        )
+
+
+def _solve(
+    database_path: Path,
+    output_path: Path,
+    read: ReadOptions,
+    options: SolveOptions,
+    overwrite: bool,
+    reporter: Reporter,
+    asked: Mapping[str, object],
+) -> None:
     from colmap_vg.colmap_io.database import check_database
     from colmap_vg.colmap_io.read import read_with_caveats
-    from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
+    from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
     from colmap_vg.solve import solve_view_graph
 
-    configure_colmap_log(reporter.verbose)
     log = StageLog(reporter.on_event)
     check_database(database_path)
     refuse_models(output_path, overwrite)
@@ -99,14 +137,12 @@ def solve(
     if not solution.registered.any():
         raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")
     with log.stage("write"), work_folder(output_path, overwrite) as work:
-        staged = [work / str(component) for component in range(int(solution.component.max()) + 1)]
+        staged = stage_models(work, int(solution.component.max()) + 1)
         with loaded_cache(database_path, work, read.min_num_inliers) as (cache, _):
             for component, folder in enumerate(staged):
-                folder.mkdir(exist_ok=True)
-                reconstruction_from_solution(cache, solution, graph, component).write(folder)
+                write_model(reconstruction_from_solution(cache, solution, graph, component), folder)
         log.result(", ".join(map(str, publish_models(staged, output_path))))
-    asked = {"database_path": database_path, "output_path": output_path, "read": read, "solve": options}
-    content = job_summary("solve", {**asked, "overwrite": overwrite, "resume": resume}, reporter)
+    content = job_summary("solve", asked, reporter)
     content |= _verdicts(graph, solution, output_path, {})
     write_summary(output_path, content)
     names = image_names(graph)
@@ -126,24 +162,29 @@ def demo(
     from colmap_vg.demo import run_demo
 
     configure_colmap_log(reporter.verbose)
-    comparison, mapped = run_demo(
-        output_path,
-        num_images=num_images,
-        seed=seed,
-        num_threads=num_threads,
-        overwrite=overwrite,
-        on_event=reporter.on_event,
-    )
     asked = {"output_path": output_path, "num_images": num_images, "seed": seed, "num_threads": num_threads}
-    _finish(
-        "demo",
-        {**asked, "overwrite": overwrite, "resume": resume},
-        mapped,
-        output_path,
-        reporter,
-        further={"comparison": plain(comparison)},
-    )
-    reporter.say(comparison.summary)
+    with recorded_job(output_path, "demo", asked, None, overwrite=overwrite, resume=resume) as job:
+        if job.finished:
+            reporter.say(DONE_BEFORE.format(output_path))
+            return
+        comparison, mapped = run_demo(
+            output_path,
+            num_images=num_images,
+            seed=seed,
+            num_threads=num_threads,
+            overwrite=job.overwrite,
+            resume=resume,
+            on_event=reporter.on_event,
+        )
+        _finish(
+            "demo",
+            {**asked, "overwrite": overwrite, "resume": resume},
+            mapped,
+            output_path,
+            reporter,
+            further={"comparison": plain(comparison)},
+        )
+        reporter.say(comparison.summary)
 
 
 def explain(output_path: Path, image: str | None, pair: tuple[str, str] | None) -> list[str]:

@@ -1,5 +1,6 @@
 """From a pose solution to a `pycolmap.Reconstruction` with the database's cameras, rigs, frames, images and ids."""
 
+import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -11,7 +12,7 @@ import pycolmap
 from colmap_vg.colmap_io.cameras import with_focal_scale
 from colmap_vg.colmap_io.database import working_copy
 from colmap_vg.colmap_io.shared_cameras import merge_cameras
-from colmap_vg.errors import DatabaseError
+from colmap_vg.errors import DatabaseError, OutputError
 from colmap_vg.solution import PoseSolution
 from colmap_vg.view_graph import ViewGraph
 
@@ -55,7 +56,7 @@ def loaded_cache(
             with pycolmap.Database.open(copy) as database:
                 options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches, load_all_images=True)
                 cache = pycolmap.DatabaseCache.create(database, options)
-        except (ValueError, RuntimeError, IndexError) as error:
+        except (ValueError, RuntimeError, IndexError, sqlite3.Error) as error:
             raise DatabaseError(f"{database_path}: pycolmap cannot read the database ({error})") from error
         yield cache, replaced
     finally:
@@ -102,3 +103,42 @@ def reconstruction_from_solution(
         frame.set_cam_from_world(image.camera_id, pose)
         reconstruction.register_frame(image.frame_id)
     return reconstruction
+
+
+def write_model(reconstruction: "pycolmap.Reconstruction", folder: Path) -> None:
+    """Write a model in COLMAP's binary format, and make sure that all of it is there.
+
+    COLMAP does not look whether its files could be written: on a full disk they end early, and it reads them all the
+    same. So their sizes are held against what the model must take.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written, or not in full.
+    """
+    try:
+        reconstruction.write(folder)
+        found = {path.name: path.stat().st_size for path in folder.iterdir()}
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"cannot write a model to {folder} ({error}); choose another --output_path") from error
+    expected = _file_sizes(reconstruction)
+    short = [name for name, size in expected.items() if found.get(name, 0) < size]
+    if short:
+        raise OutputError(
+            f"{folder / short[0]} has {found.get(short[0], 0)} of {expected[short[0]]} bytes: the disk is full, or a"
+            " limit on the size of files was reached; make room or choose another --output_path"
+        )
+
+
+def _file_sizes(reconstruction: "pycolmap.Reconstruction") -> dict[str, int]:
+    """Bytes of the files that hold cameras, images and points: COLMAP's ``*.bin``, all numbers of fixed width."""
+    cameras = reconstruction.cameras.values()
+    images = [reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()]
+    points = reconstruction.points3D.values()
+    return {
+        "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in cameras),
+        "images.bin": 8 + sum(73 + len(image.name.encode()) + 24 * image.num_points2D() for image in images),
+        "points3D.bin": 8 + sum(51 + 8 * point.track.length() for point in points),
+        "frames.bin": 8 + 84 * reconstruction.num_reg_frames(),
+        "rigs.bin": 8 + 16 * reconstruction.num_rigs(),
+    }

@@ -1,5 +1,6 @@
 """The demo: photographs rendered from known cameras, reconstructed with nothing else known, compared with the truth."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_vg.demo.photographs import RING_RADIUS, TrueCameras, render_photographs, write_truth
+from colmap_vg.demo.photographs import RING_RADIUS, TrueCameras, render_photographs, true_cameras, write_truth
 from colmap_vg.errors import OptionError, OutputError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.image_folder import DATABASE_NAME, make_database
 from colmap_vg.mapper import MappingResult, map_database
 from colmap_vg.options import FeatureOptions, MappingOptions
-from colmap_vg.output_folder import work_folder
+from colmap_vg.output_folder import output_lock, work_folder
 from colmap_vg.stages import StageEvent, StageLog
 
 __all__ = ["DemoResult", "render_photographs", "run_demo"]
@@ -68,6 +69,7 @@ def run_demo(
     seed: int = 0,
     num_threads: int = -1,
     overwrite: bool = False,
+    resume: bool = False,
     on_event: Callable[[StageEvent], None] | None = None,
 ) -> tuple[DemoResult, MappingResult]:
     """Render photographs, reconstruct them, and compare the model with the truth.
@@ -84,6 +86,8 @@ def run_demo(
         -1: all cores.
     overwrite : bool
         Replace what an earlier demo left in the output.
+    resume : bool
+        Reuse the photographs and the database of an interrupted demo of the same number of images and seed.
     on_event : callable, optional
         Called with a `StageEvent` whenever a stage starts, gets on, ends, or has something to warn of.
 
@@ -102,28 +106,47 @@ def run_demo(
         raise OptionError(f"num_images is {num_images}: a model needs 3 images or more")
     output, log = Path(output_path), StageLog(on_event)
     image_path = output / "images"
-    with work_folder(output, overwrite) as work:
-        if image_path.exists() and not overwrite:
-            raise OutputError(f"{image_path} exists: choose another --output_path, or replace it with --overwrite")
-        rendered = work / "images"
-        shutil.rmtree(rendered, ignore_errors=True)
-        rendered.mkdir()
-        with log.stage("render"):
-            cameras = render_photographs(
-                rendered,
-                num_images=num_images,
-                seed=seed,
-                on_image=lambda done: log.progress(f"{done} of {num_images} photographs", done / num_images),
-            )
-            write_truth(output / "truth.txt", cameras)
-            shutil.rmtree(image_path, ignore_errors=True)
-            rendered.rename(image_path)
-            log.result(f"{num_images} photographs in {image_path}")
-    features = FeatureOptions(num_threads=num_threads, random_seed=seed)
-    make_database(image_path, output, features, log, overwrite=overwrite)
-    options = MappingOptions(num_threads=num_threads, random_seed=seed, overwrite=overwrite)
-    mapped = map_database(output / DATABASE_NAME, image_path, output, options, log)
+    with output_lock(output):
+        cameras = _photographs(output, num_images, seed, log, overwrite=overwrite, resume=resume)
+        features = FeatureOptions(num_threads=num_threads, random_seed=seed)
+        make_database(image_path, output, features, log, overwrite=overwrite, resume=resume)
+        options = MappingOptions(num_threads=num_threads, random_seed=seed, overwrite=overwrite)
+        mapped = map_database(output / DATABASE_NAME, image_path, output, options, log)
     return compared(mapped.models[0], cameras), mapped
+
+
+def _photographs(
+    output: Path, num_images: int, seed: int, log: StageLog, *, overwrite: bool, resume: bool
+) -> TrueCameras:
+    """The photographs in ``output/images``, rendered or, to go on with, as they are; they appear all or none."""
+    image_path = output / "images"
+    with work_folder(output, overwrite) as work:
+        record, made = work / "photographs.json", json.dumps({"num_images": num_images, "seed": seed})
+        try:
+            if resume and image_path.exists() and record.exists() and record.read_text(encoding="utf-8") == made:
+                log.progress(f"reusing {image_path}")
+                return true_cameras(num_images, seed)
+            if image_path.exists() and not overwrite and not record.exists():
+                raise OutputError(f"{image_path} exists: choose another --output_path, or replace it with --overwrite")
+            rendered = work / "images"
+            shutil.rmtree(rendered, ignore_errors=True)
+            rendered.mkdir()
+            with log.stage("render"):
+                cameras = render_photographs(
+                    rendered,
+                    num_images=num_images,
+                    seed=seed,
+                    on_image=lambda done: log.progress(f"{done} of {num_images} photographs", done / num_images),
+                )
+                write_truth(output / "truth.txt", cameras)
+                if image_path.exists():
+                    shutil.rmtree(image_path)
+                record.write_text(made, encoding="utf-8")
+                rendered.rename(image_path)
+                log.result(f"{num_images} photographs in {image_path}")
+        except OSError as error:
+            raise OutputError(f"cannot write {image_path}: {error.strerror}; choose another --output_path") from error
+    return cameras
 
 
 def compared(model: "pycolmap.Reconstruction", cameras: TrueCameras) -> DemoResult:

@@ -91,20 +91,25 @@ def render_photographs(
     """
     import cv2
 
-    scene_rng, ring_rng, *image_rngs = np.random.default_rng(seed).spawn(2 + num_images)
+    scene_rng, _, *image_rngs = np.random.default_rng(seed).spawn(2 + num_images)
     caster = RayCaster(paint(build_ruin(scene_rng), scene_rng))
-    rotations, centers = camera_ring(num_images, ring_rng)
-    camera = true_camera()
-    rays = pixel_rays(camera)
-    names = tuple(f"{k:04d}.jpg" for k in range(num_images))
-    for k, name in enumerate(names):
-        pixels = photograph(caster, rays, rotations[k], centers[k], image_rngs[k])
+    cameras = true_cameras(num_images, seed)
+    rays = pixel_rays(cameras.camera)
+    for k, name in enumerate(cameras.names):
+        pixels = photograph(caster, rays, cameras.rotations[k], cameras.centers[k], image_rngs[k])
         _, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 93])
         exif = with_focal_length(jpeg.tobytes(), "colmap_vg", "demo", _FOCAL_35MM / 5.6, round(_FOCAL_35MM))
         (image_path / name).write_bytes(exif)
         if on_image is not None:
             on_image(k + 1)
-    return TrueCameras(names, rotations, centers, camera)
+    return cameras
+
+
+def true_cameras(num_images: int, seed: int) -> TrueCameras:
+    """The cameras of :func:`render_photographs`, without their photographs."""
+    _, ring_rng, *_ = np.random.default_rng(seed).spawn(2 + num_images)
+    rotations, centers = camera_ring(num_images, ring_rng)
+    return TrueCameras(tuple(f"{k:04d}.jpg" for k in range(num_images)), rotations, centers, true_camera())
 
 
 def write_truth(path: Path, cameras: TrueCameras) -> None:

@@ -22,6 +22,8 @@ from colmap_vg.stages import StageLog
 MIN_IMAGES = 3
 """Images; two views have no redundancy that could tell a right model from a wrong one."""
 
+UNREADABLE = "COLMAP cannot read it"
+
 IMAGES_PER_CALL = 8
 """Images per thread and call of pycolmap: progress is told between calls, and a call ends with idle threads."""
 
@@ -207,7 +209,7 @@ def _import_images(
         log.progress("reading the photographs")
         pycolmap.import_images(database_path, image_path, _camera_mode(options), new, _reader_options(options))
         known = _image_names(database_path)
-    unreadable = [SkippedFile(name, "COLMAP cannot read it") for name in names if name not in known]
+    unreadable = [SkippedFile(name, UNREADABLE) for name in names if name not in known]
     for file in unreadable:
         log.warn(f"skipped {file.name}: {file.reason}")
     readable = [name for name in names if name in known]
