@@ -31,7 +31,6 @@ BoolArray = NDArray[np.bool_]
 
 _MAX_DAMPING = 1e6  # shares of the Hessian's diagonal
 _SHORTEST_BASELINE = 1e-6  # of the RMS distance of cameras; keeps the direction of coinciding cameras finite
-_MIN_SLOPE = 0.25  # of the weights; reweighted least squares takes one, and Newton's method half of it for plain noise
 _COARSE = 300.0  # the next scale moves the cameras more than the last digits of this one
 _MAX_LOG_FOCAL_STEP = 0.3
 _MAX_LOG_FOCAL = np.log(3.0)  # cameras with nearly no focal length see anything without an error
@@ -252,8 +251,7 @@ def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float) -> list[Cam
         problem.matches(cameras.log_scales), R, d, np.full(len(edges), scale), with_focals=with_focals
     )
     chain = edge_chain(cameras.rotations[edges[:, 0]], R, d, length)
-    hessians = at.hessians * np.maximum(at.slopes, _MIN_SLOPE)[:, None, None]
-    terms = [CameraTerms.chained(edges, at.costs, at.gradients, hessians, chain)]
+    terms = [CameraTerms.chained(edges, at.costs, at.gradients, at.newton_hessians, chain)]
     if problem.triplets is not None:
         images = problem.triplets.images
         rays = problem.triplet_rays(problem.triplets, cameras.log_scales)

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _MIN_SIGMA_PX = 0.02  # pixels; keypoints are not better than this, and exact data keep finite information
+_TOLERANCES = (1e-2, 1e-5, 1e-7)  # of each round's cost; the next round's scale makes more of a difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +98,18 @@ def refine_relative_poses(
     R, d = rotations.astype(np.float64), normalized(directions.astype(np.float64))
     information, median, sigma = np.zeros((m, 5, 5)), np.full(m, np.nan), np.full(m, np.nan)
     matches = Matches.of_rays(offsets, bearings1, bearings2, focal_lengths1**-2.0, focal_lengths2**-2.0).of(filled)
-    num_rounds = 3
-    for _ in range(num_rounds):
+    for tolerance in _TOLERANCES:
         scale = EFFICIENT_CAUCHY * _robust_sigmas(matches, R[filled], d[filled])
-        R[filled], d[filled] = _levenberg(matches, R[filled], d[filled], scale, -(-num_iterations // num_rounds))
+        most = -(-num_iterations // len(_TOLERANCES))
+        R[filled], d[filled] = _levenberg(matches, R[filled], d[filled], scale, most, tolerance)
     median[filled], sigma[filled] = _medians_and_sigmas(matches, R[filled], d[filled])
     information[filled] = _information(matches, R[filled], d[filled], sigma[filled])
     return RefinedEdges(R, d, information, median, sigma)
 
 
-def _levenberg(matches: Matches, R: Array, d: Array, scale: Array, num_iterations: int) -> tuple[Array, Array]:
+def _levenberg(
+    matches: Matches, R: Array, d: Array, scale: Array, num_iterations: int, tolerance: float
+) -> tuple[Array, Array]:
     """Levenberg-Marquardt at a fixed Cauchy scale (m,) in pixels; edges leave when their cost stands still."""
     R, d = R.copy(), d.copy()
     damping = np.full(len(R), 1e-4)
@@ -114,7 +117,7 @@ def _levenberg(matches: Matches, R: Array, d: Array, scale: Array, num_iteration
     for _ in range(num_iterations):
         at_work = matches.of(active)
         at = normal_equations(at_work, R[active], d[active], scale[active])
-        cost, gradient, hessian = at.costs, at.gradients, at.hessians
+        cost, gradient, hessian = at.costs, at.gradients, at.newton_hessians
         diagonal = np.einsum("maa->ma", hessian)
         # Marquardt's scaling, with a floor so that a direction that no match sees stays where it is.
         level = damping[active, None] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-30
@@ -126,7 +129,7 @@ def _levenberg(matches: Matches, R: Array, d: Array, scale: Array, num_iteration
         better = new_cost < cost
         R[active[better]], d[active[better]] = new_R[better], new_d[better]
         damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), 1e-10, 1e8)
-        still = np.abs(cost - new_cost) <= 1e-7 * cost
+        still = np.abs(cost - new_cost) <= tolerance * cost
         active = active[~still & (damping[active] < 1e6)]
         if not len(active):
             break

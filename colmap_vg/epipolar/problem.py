@@ -12,7 +12,8 @@ from colmap_vg.epipolar.sampson import Matches, cut_rays
 from colmap_vg.epipolar.triplets import Triplets, find_triplets
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.options import SolveOptions
-from colmap_vg.two_view.segments import rows_of_segments
+from colmap_vg.two_view.segments import rows_of_segments, segment_subset
+from colmap_vg.two_view.spread import well_spread
 from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
@@ -95,7 +96,7 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
     graph : ViewGraph
     part : Subgraph
     options : SolveOptions
-        `refine_focal_lengths`.
+        `refine_focal_lengths` and `max_matches_per_edge`.
 
     Returns
     -------
@@ -127,6 +128,9 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
             rays2[rows],
             graph.cam2_from_cam1_rotations[part.edge_rows],
         )
+    # Triplets come from all matches: thinned pairs share few tracks.
+    spread = well_spread(part_offsets, rays1[rows], options.max_matches_per_edge)
+    rows, part_offsets = rows[spread], segment_subset(part_offsets, spread)
     camera_idx = group[camera_idx[part.images]]
     seen = np.isin(np.arange(len(of_group)), camera_idx)
     focals, free = focals[of_group], refined[of_group] & seen

@@ -23,6 +23,7 @@ from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+_MIN_SLOPE = 0.25  # share of the weights that is left where outliers have taken all
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +71,19 @@ def cut_rays(offsets: IntArray, bearings1: Array, bearings2: Array) -> Pieces:
 class NormalEquations:
     """Robust cost (m,), gradient (m, b) and Gauss-Newton Hessian (m, b, b) of each edge, squared pixels.
 
-    `slopes` (m,) are sums of the influence function's slopes over sums of weights. The Hessian is that of reweighted
-    least squares, by the weights; Newton's method goes by the slopes, and steps twice as far under plain noise.
+    `slopes` (m,) are sums of the influence function's slopes over sums of weights.
     """
 
     costs: Array
     gradients: Array
     hessians: Array
     slopes: Array
+
+    @property
+    def newton_hessians(self) -> Array:
+        """Hessians by slopes where those of reweighted least squares go by weights, which under plain noise makes half
+        of the step that it takes."""
+        return self.hessians * np.maximum(self.slopes, _MIN_SLOPE)[:, None, None]
 
 
 @dataclass(frozen=True, eq=False)
