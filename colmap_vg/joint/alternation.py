@@ -2,7 +2,8 @@
 
 Each outer iteration sets ``lambda_ij = ||p_j - p_i||`` and solves PS for translations ``lambda_ij gamma^l_ij`` with
 rotation weight 1 and position weight ``w_ij = 1`` (**2C**, displacement error) or ``1 / ||p_j - p_i||^2`` (**2O**,
-direction error); then the centroid goes to 0 and ``sum ||p||^2`` back to what the start had. In 2C that scale is the
+direction error); then the centroid goes to 0 and ``sum ||p||^2`` back to what the start had, and cameras stay within
+the start's reach, as in Alg. 1. In 2C that scale is the
 weight between the two terms; 2O does not depend on it.
 
 The inner problem is solved as exactly as the outer change of the moment deserves, so the fixed point is that of exact
@@ -20,7 +21,12 @@ from colmap_vg.geometry.directions import tangent_basis
 from colmap_vg.joint.costs import ChordalCost, InformationCost, PoseGraphCost
 from colmap_vg.joint.pose_graph import PoseGraphSolver
 from colmap_vg.linear.anderson import fixed_point
-from colmap_vg.positions.fixed_point import MIN_RELATIVE_LENGTH, shortest_weighted_length
+from colmap_vg.positions.fixed_point import (
+    MIN_RELATIVE_LENGTH,
+    farthest_allowed,
+    regauged,
+    shortest_weighted_length,
+)
 from colmap_vg.positions.result import centered, spread, unit_weights
 from colmap_vg.solution import LogEntry
 
@@ -113,6 +119,7 @@ def solve_joint(
     size = spread(start_p)
     unit = size / np.sqrt(num_images)
     shortest, shortest_weighted = MIN_RELATIVE_LENGTH * unit, shortest_weighted_length(start_p, edges)
+    reach = farthest_allowed(start_p)
     log: list[LogEntry] = []
     # The plain form solves every inner problem well, as the paper has it; the accelerated one as the moment deserves.
     inner_tolerance, last_cost, shrinkage = 1e-3 if accelerate else 1e-6, np.inf, 1.0
@@ -143,7 +150,7 @@ def solve_joint(
         turn = start_Q[0] @ Q[0].T
         Q, p = turn @ Q, centered(p @ turn.T)
         shrinkage = spread(p) / size
-        return pack(Q, p / shrinkage)
+        return pack(Q, regauged(p, size, reach))
 
     def note(iteration: int, _: Array, change: float) -> None:
         nonlocal inner_tolerance

@@ -15,23 +15,38 @@ class AndersonMixer:
     the residual ``||g(x) - x||`` grows by more than `max_growth` over the best one, the memory is thrown away and the
     plain step is taken.
 
+    A mode that the plain iteration lets grow on its way to a far fixed point looks to the mixer like one to be undone:
+    it would hold the iteration near a point that repels. So, where the residual has not halved in `patience` proposals,
+    plain steps follow until it is a tenth.
+
     Parameters
     ----------
     depth : int
         Differences remembered.
     max_growth : float
+    patience : int
     """
 
-    def __init__(self, depth: int = 8, max_growth: float = 2.0) -> None:
-        self._depth, self._max_growth = depth, max_growth
+    def __init__(self, depth: int = 8, max_growth: float = 2.0, patience: int = 20) -> None:
+        self._depth, self._max_growth, self._patience = depth, max_growth, patience
         self._images: list[Array] = []
         self._residuals: list[Array] = []
         self._best = np.inf
+        self._goal, self._since, self._plain_above = np.inf, 0, np.inf
 
     def propose(self, x: Array, image: Array) -> Array:
         """Next point after ``image = g(x)``, flat arrays."""
         residual = image - x
         norm = float(np.linalg.norm(residual))
+        if norm > self._plain_above:
+            return image
+        self._since += 1
+        if norm < self._goal:
+            self._goal, self._since = 0.5 * norm, 0
+        elif self._since > self._patience:
+            self._images, self._residuals, self._best = [], [], np.inf
+            self._goal, self._since, self._plain_above = np.inf, 0, 0.1 * norm
+            return image
         if norm > self._max_growth * self._best:
             self._images, self._residuals = [], []
         self._best = min(self._best, norm)

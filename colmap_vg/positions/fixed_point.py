@@ -7,7 +7,9 @@
   cameras do not fall into one point.
 
 After each iteration the centroid goes to 0 and ``sum ||p||^2`` back to what the start had; nothing else keeps 1C from
-shrinking. The fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C
+shrinking. Cameras stay within the reach of the start (:func:`farthest_allowed`): one whose few directions all but
+agree, as at a leaf of a noisy graph, would go to infinity, and the gauge would draw the others into one point. Where
+none is held so, the fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C
 ``sum_j (c d - ||d|| gamma) = 0``, with ``d = p_j - p_i`` and c the multiplier of the gauge. Anderson acceleration
 reaches the same point sooner.
 """
@@ -28,9 +30,12 @@ IntArray = NDArray[np.int64]
 
 MIN_RELATIVE_LENGTH = 1e-8
 """Edges shorter than this share of the spread count as this long: direction weights stay finite."""
-MIN_WEIGHTED_LENGTH = 1e-2
+MIN_WEIGHTED_LENGTH = 0.1
 """Edges shorter than this share of the start's median edge weigh as if they were this long in 1O and 2O. Their own
-weight, one over the squared length, would draw two cameras with contradicting edges into one point, ever faster."""
+weight, one over the squared length, would draw cameras with contradicting edges into one point, ever faster."""
+REACH_QUANTILE, LEAST_REACH = 0.95, 1.5
+"""Common reach of the cameras: what this share of them keeps at the start, and at least so many root mean square
+distances. A start that stands farther out may stay."""
 
 
 def solve_fixed_point(
@@ -77,7 +82,7 @@ def solve_fixed_point(
     w = unit_weights(weights, len(edges))
     start = centered(initial_centers)
     size = spread(start)
-    shortest = shortest_weighted_length(start, edges)
+    shortest, reach = shortest_weighted_length(start, edges), farthest_allowed(start)
     system = LaplacianSystem(num_images, edges)
     fixed_factor = system.factor(w) if approach == "C" else None
     log: list[LogEntry] = []
@@ -89,8 +94,7 @@ def solve_fixed_point(
         else:
             weights = w / np.maximum(length, shortest) ** 2
             new = system.factor(weights).solve(system.right_side(weights * length, directions_world))
-        new = centered(new)
-        return np.asarray(new * (size / spread(new)))
+        return regauged(new, size, reach)
 
     def note(iteration: int, p: Array, change: float) -> None:
         log.append(LogEntry("1" + approach, iteration, _cost(p, edges, directions_world, w, approach), change))
@@ -129,6 +133,24 @@ class LaplacianSystem:
 def shortest_weighted_length(start: Array, edges: IntArray) -> float:
     """Length below which edges weigh no more; the gauge keeps the scale, so that the start's edges tell it."""
     return MIN_WEIGHTED_LENGTH * float(np.median(np.linalg.norm(start[edges[:, 1]] - start[edges[:, 0]], axis=1)))
+
+
+def farthest_allowed(start: Array) -> Array:
+    """Distance from the centroid that each camera may reach, (n,), from positions with centroid 0."""
+    distance = np.linalg.norm(start, axis=1)
+    rms = float(np.sqrt(np.mean(distance**2)))
+    return np.asarray(np.maximum(distance, max(float(np.quantile(distance, REACH_QUANTILE)), LEAST_REACH * rms)))
+
+
+def regauged(p: Array, size: float, reach: Array) -> Array:
+    """Positions with centroid 0 and spread `size`, after those beyond their reach were drawn back to it."""
+    p = centered(p)
+    p = p * (size / spread(p))
+    distance = np.linalg.norm(p, axis=1)
+    if (distance <= reach).all():
+        return np.asarray(p)
+    p = centered(p * np.minimum(1.0, reach / np.maximum(distance, np.finfo(float).tiny))[:, None])
+    return np.asarray(p * (size / spread(p)))
 
 
 def edge_lengths(p: Array, edges: IntArray, size: float) -> Array:

@@ -8,6 +8,7 @@ from position_problems import ring_problem
 
 from colmap_vg import align_positions
 from colmap_vg.geometry import so3
+from colmap_vg.geometry.directions import normalized
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.positions.fixed_point import solve_fixed_point
 
@@ -154,3 +155,27 @@ def test_same_bits_again():
     start = _start(problem)
     a, b = (solve_fixed_point(*problem.measured, start, "O").projection_centers for _ in range(2))
     assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("approach", APPROACHES)
+def test_a_camera_whose_directions_diverge_does_not_leave_with_the_scale(approach):
+    problem = ring_problem(40, 8)
+    leaf = len(problem.centers)
+    toward = normalized(np.array([[1.0, 0.2, 0.1]]))[0]
+    ends = np.array([0, 1])
+    # Noise has turned the two directions apart: the leaf's best place is at infinity.
+    apart = problem.centers[1] - problem.centers[0]
+    directions = normalized(np.stack([toward - 0.02 * apart, toward + 0.02 * apart]))
+    edges = np.concatenate([problem.edges, np.stack([ends, [leaf, leaf]], axis=1)])
+    measured = (leaf + 1, edges, np.concatenate([problem.directions, directions]))
+    start = solve_cls(*measured).projection_centers
+    farthest = max(1.5 * np.linalg.norm(start) / np.sqrt(leaf + 1), np.linalg.norm(start, axis=1).max())
+    fast, plain = (
+        solve_fixed_point(*measured, start, approach, accelerate=accelerate, max_num_iterations=5000)
+        for accelerate in (True, False)
+    )
+    for result in (fast, plain):
+        assert result.converged
+        assert np.linalg.norm(result.projection_centers[leaf]) < 1.01 * farthest
+        assert align_positions(result.projection_centers[:leaf], problem.centers)[0].max() < 0.02 * 4.0
+    assert np.linalg.norm(fast.projection_centers - plain.projection_centers) < 1e-6 * np.linalg.norm(start)
