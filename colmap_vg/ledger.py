@@ -85,6 +85,15 @@ class Ledger:
         kept[part.edge_rows[directed][edges]] = True
         return Subgraph.of(self.graph.edges, inside, kept)
 
+    def without(self, part: Subgraph, leaving: BoolArray, verdict: ImageVerdict, seed: int) -> Subgraph:
+        """The largest parallel-rigid part after some of a part's images (k,) have left for a reason."""
+        self.image_verdicts[part.images[leaving]] = verdict
+        staying = np.zeros(self.graph.num_images, dtype=bool)
+        staying[part.images[~leaving]] = True
+        kept = np.zeros(self.graph.num_edges, dtype=bool)
+        kept[part.edge_rows] = True
+        return self.largest_rigid_part(Subgraph.of(self.graph.edges, staying, kept), seed)
+
     def place(self, part: Subgraph, rotations: Array, centers: Array, focal_scales: Array, converged: bool) -> None:
         """Take down the poses of a part as a component of its own; centroid 0, root mean square distance 1."""
         moved = centers - centers.mean(axis=0)

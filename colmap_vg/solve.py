@@ -17,6 +17,7 @@ from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.joint.alternation import solve_joint
 from colmap_vg.ledger import Ledger, num_cameras
+from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import SolveOptions
 from colmap_vg.positions.bata import solve_bata
 from colmap_vg.positions.cls import solve_cls
@@ -26,6 +27,7 @@ from colmap_vg.positions.direction_filter import robust_direction_residuals
 from colmap_vg.positions.fixed_point import solve_fixed_point
 from colmap_vg.positions.lud import solve_lud
 from colmap_vg.positions.orthogonal import solve_orthogonal
+from colmap_vg.positions.robust_directions import position_deviations, solve_robust_directions
 from colmap_vg.positions.shapefit import solve_shapefit
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.rotations.robust import average_rotations_robust, rotation_residuals
@@ -40,6 +42,11 @@ MIN_COMPONENT_IMAGES = 3
 """Two images have no more than a direction between them."""
 ROUGH_ITERATIONS = 20
 """Outer iterations of Alg. 2 before the epipolar adjustment, at most."""
+MAX_DEVIATION = 0.1
+"""Of a position, shares of the scene's median radius, where directions alone fix it: five times it is half of that."""
+MAX_SHARE_LEAVING, MAX_ROUNDS_OF_LEAVING = 0.1, 20
+"""Images that leave at once, and how often: one that is far off takes its neighbours' certainty with it, so that of
+those that leave together none is three times as certain as another."""
 TRIAL_SHARE = 0.25
 """Share of the rotation gate that pairs on trial must keep within: one false pair in 10^5 does, by chance."""
 
@@ -53,6 +60,7 @@ _BASELINES = {
 }
 
 
+@single_threaded_blas
 def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> PoseSolution:
     """Solve all rotations and positions of a viewing graph's parallel-rigid parts of three images or more.
 
@@ -84,7 +92,7 @@ def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> P
             continue
         own = rotations[gated.rows_of(rigid.images)]
         poses = _Poses(own, np.zeros((rigid.num_images, 3)), np.ones(num_cameras(graph)))
-        poses = _solve_poses(ledger, rigid, poses, options)
+        rigid, poses = _solve_part(ledger, rigid, poses, options)
         ledger.place(rigid, poses.rotations, poses.centers, poses.focal_scales, poses.converged)
         unsolved[rigid.images] = False
 
@@ -148,16 +156,52 @@ def _filter_directions(ledger: Ledger, part: Subgraph, rotations: Array, options
     return ledger.largest_rigid_part(rigid, options.random_seed)
 
 
+def _solve_part(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOptions) -> tuple[Subgraph, _Poses]:
+    """Poses by the method chosen, of the images that it can place."""
+    if options.method != "epipolar":
+        return part, _solve_poses(ledger, part, poses, options)
+    problem = epipolar_problem(ledger.graph, part, options)
+    if problem is None:
+        return _solve_directions(ledger, part, poses, options)
+    # The adjustment goes on from wherever Alg. 2 is: its last digits would be lost work.
+    rough = replace(options, method="2O", max_num_iterations=ROUGH_ITERATIONS, convergence_tolerance=1e-3)
+    return part, _adjust_epipolar(ledger, part, problem, _solve_poses(ledger, part, poses, rough))
+
+
+def _solve_directions(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOptions) -> tuple[Subgraph, _Poses]:
+    """Positions by a robust fit of the directions; images that these do not fix well leave, the worst first."""
+    whole, start = part, None
+    for rounds_left in reversed(range(MAX_ROUNDS_OF_LEAVING + 1)):
+        n, rotations = part.num_images, poses.rotations[whole.rows_of(part.images)]
+        directions = _world_directions(ledger.graph, part, rotations)
+        weights = edge_weights(ledger.graph, part.edge_rows, options)
+        if start is None:
+            start = solve_cls(n, part.edges, directions, weights).projection_centers
+            start = solve_fixed_point(n, part.edges, directions, start, "C", weights, tolerance=1e-3).projection_centers
+        solved = solve_robust_directions(n, part.edges, directions, start, weights)
+        ledger.log.extend(solved.positions.log)
+        centers = solved.positions.projection_centers
+        deviations = position_deviations(n, part.edges, solved, options.random_seed)
+        radius = float(np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
+        uncertain = deviations > MAX_DEVIATION * radius
+        if not uncertain.any() or rounds_left == 0:
+            break
+        worst = max(np.quantile(deviations, 1.0 - MAX_SHARE_LEAVING), deviations.max() / 3.0)
+        leaving = uncertain & (deviations >= worst)
+        smaller = ledger.without(part, leaving, ImageVerdict.UNCERTAIN, options.random_seed)
+        if smaller.num_images < MIN_COMPONENT_IMAGES:
+            break
+        part, start = smaller, centers[part.rows_of(smaller.images)]
+    if uncertain.any():
+        ledger.caveats.append(
+            f"{int(uncertain.sum())} of {n} positions are uncertain: {ImageVerdict.UNCERTAIN.reason}."
+        )
+    return part, _Poses(rotations, centers, poses.focal_scales, solved.positions.converged)
+
+
 def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOptions) -> _Poses:
-    """Positions, or positions and rotations, by the method chosen."""
+    """Positions, or positions and rotations, by an algorithm on relative poses."""
     graph, method, n = ledger.graph, options.method, part.num_images
-    if method == "epipolar":
-        problem = epipolar_problem(graph, part, options)
-        if problem is not None:
-            # The adjustment goes on from wherever Alg. 2 is: its last digits would be lost work.
-            rough = replace(options, method="2O", max_num_iterations=ROUGH_ITERATIONS, convergence_tolerance=1e-3)
-            return _adjust_epipolar(ledger, part, problem, _solve_poses(ledger, part, poses, rough))
-        method = "2O"
     directions = _world_directions(graph, part, poses.rotations)
     weights = edge_weights(graph, part.edge_rows, options)
     if method in _BASELINES:

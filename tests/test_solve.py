@@ -137,6 +137,28 @@ def test_parts_that_nothing_links_are_components_of_their_own():
         assert np.mean(np.sum(solution.projection_centers[rows] ** 2, axis=1)) == pytest.approx(1.0)
 
 
+def test_images_whose_directions_hardly_fix_them_are_left_out():
+    scene = ring_scene(40, 8, direction_sigma=0.01, rotation_sigma=0.002, seed=5)
+    g, rng = scene.graph, np.random.default_rng(5)
+    # One more image, far outside, is seen by two neighbours under nearly the same direction.
+    center = scene.projection_centers.mean(axis=0) + 40 * (scene.projection_centers[0] - scene.projection_centers[1])
+    R = np.concatenate([scene.cam_from_world_rotations, np.eye(3)[None]])
+    p = np.concatenate([scene.projection_centers, center[None]])
+    new = np.array([[0, 40], [1, 40]])
+    directions = np.einsum("kab,kb->ka", R[new[:, 0]], p[40] - p[new[:, 0]])
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) + 0.01 * rng.standard_normal((2, 3))
+    graph = ViewGraph(
+        np.arange(41),
+        np.concatenate([g.edges, new]),
+        np.concatenate([g.cam2_from_cam1_rotations, np.swapaxes(R[new[:, 0]], 1, 2)]),
+        np.concatenate([g.cam2_in_cam1_directions, directions / np.linalg.norm(directions, axis=1, keepdims=True)]),
+    )
+    solution = solve_view_graph(graph)
+    assert solution.image_verdicts[40] == ImageVerdict.UNCERTAIN
+    assert solution.registered[:40].all()
+    assert align_positions(solution.projection_centers[:40], scene.projection_centers)[0].max() < 0.05
+
+
 def test_edges_refused_on_reading_are_not_used():
     scene = ring_scene(20, 6)
     words = np.full(scene.graph.num_edges, EdgeVerdict.KEPT, dtype=object)

@@ -10,6 +10,7 @@ from colmap_vg.colmap_io.cameras import bearings_of_keypoints, with_focal_scale
 from colmap_vg.colmap_io.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.colmap_io.relative_poses import relative_poses
 from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
+from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
 from colmap_vg.two_view.segments import evenly_thinned, segment_subset
 from colmap_vg.view_graph import ViewGraph
@@ -43,6 +44,7 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
     return graph
 
 
+@single_threaded_blas
 def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) -> tuple[ViewGraph, tuple[str, ...]]:
     """The viewing graph, and what was changed or could not be decided on reading, one sentence each."""
     tables = read_tables(database_path)

@@ -17,13 +17,10 @@ from colmap_vg.errors import GraphError
 
 Array = NDArray[np.float64]
 
-DENSE_BELOW = 64
-"""Below this LAPACK does not start threads, which on a busy machine wait for each other: with two cores a Cholesky
-factor of 138 unknowns took 0.2 to 290 ms with them, one of 600 took 3 to 1,440 ms; SuperLU 0.5 and 29 ms."""
-DENSE_FROM, DENSE_LIMIT = 2_000, 12_000
-"""Unknowns between which LAPACK is faster than SuperLU, even if its threads wait, where the matrix is nearly full."""
-DENSE_FILL = 0.1
-"""Share of nonzeros from which on a matrix counts as nearly full."""
+DENSE_BELOW = 300
+"""Up to this many unknowns LAPACK, with one thread, is faster than building a sparse factor of any fill."""
+DENSE_FILL, DENSE_LIMIT = 0.05, 12_000
+"""From this share of nonzeros on, up to so many unknowns, LAPACK is faster than SuperLU: 29 against 88 ms on 1,000."""
 
 
 class Factor(Protocol):
@@ -87,6 +84,6 @@ def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
     """
     n = matrix.shape[0]
     fill = matrix.nnz / max(1, n * n)
-    if n <= DENSE_BELOW or (fill >= DENSE_FILL and DENSE_FROM <= n <= DENSE_LIMIT):
+    if n <= DENSE_BELOW or (fill >= DENSE_FILL and n <= DENSE_LIMIT):
         return _CholeskyFactor(matrix.toarray())
     return _SuperLUFactor(matrix, check_definite)
