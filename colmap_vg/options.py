@@ -54,6 +54,7 @@ class SolveOptions(_Checked):
 
     method: Method = "epipolar"
     rotation_averaging: RotationAveraging = "robust"
+    certify_rotations: bool = False  # say in the caveats whether chordal rotations are the global optimum (eigenvalue)
     outlier_filter: OutlierFilter = "robust"
     rotation_gate_deg: float = _number(10.0, 0.0, 180.0)  # degrees; edges beyond it are dropped; 0: no gate
     one_dsfm_threshold: float = _number(0.1, 0.0)  # broken weight, mean |projection|

@@ -29,9 +29,10 @@ from colmap_vg.positions.lud import solve_lud
 from colmap_vg.positions.orthogonal import solve_orthogonal
 from colmap_vg.positions.robust_directions import position_deviations, solve_robust_directions
 from colmap_vg.positions.shapefit import solve_shapefit
+from colmap_vg.rotations.certificate import certify_chordal
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.rotations.robust import average_rotations_robust, rotation_residuals
-from colmap_vg.solution import PoseSolution
+from colmap_vg.solution import LogEntry, PoseSolution
 from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.view_graph import ViewGraph
 
@@ -113,17 +114,36 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
     average = average_rotations_robust if options.rotation_averaging == "robust" else average_rotations_chordal
     while part.num_images >= 2:
         relative = graph.cam2_from_cam1_rotations[part.edge_rows]
-        result = average(part.num_images, part.edges, relative, edge_weights(graph, part.edge_rows, options))
+        weights = edge_weights(graph, part.edge_rows, options)
+        result = average(part.num_images, part.edges, relative, weights)
         rotations = result.cam_from_world_rotations
         bad = rotation_residuals(part.edges, relative, rotations) > np.radians(options.rotation_gate_deg)
         if options.rotation_gate_deg == 0.0 or not bad.any():
             ledger.log.extend(result.log)
+            if options.certify_rotations:
+                _certify_rotations(ledger, part, relative, rotations, weights, options)
             return rotations, part
         ledger.drop(part.edge_rows[bad], EdgeVerdict.ROTATION_OUTLIER)
         images = np.zeros(graph.num_images, dtype=bool)
         images[part.images] = True
         part = ledger.largest_component(images, ImageVerdict.CUT_OFF)
     return np.zeros((part.num_images, 3, 3)), part
+
+
+def _certify_rotations(
+    ledger: Ledger, part: Subgraph, relative: Array, rotations: Array, weights: Array, options: SolveOptions
+) -> None:
+    """Log the smallest eigenvalue of the dual certificate, and say in a caveat what it tells."""
+    if options.rotation_averaging != "chordal":
+        ledger.caveats.append("The rotations are not certified: certificates are for rotation_averaging='chordal'.")
+        return
+    found = certify_chordal(part.num_images, part.edges, relative, rotations, weights)
+    ledger.log.append(LogEntry("certificate", 0, found.lower_bound, found.smallest_eigenvalue))
+    told = "are the global optimum" if found.is_global else "may not be the global optimum"
+    ledger.caveats.append(
+        f"The chordal rotations of {part.num_images} images {told}: the certificate's smallest eigenvalue is "
+        f"{found.smallest_eigenvalue:.3g}, and no rotations cost less than {1.0 - found.relative_gap:.6f} of theirs."
+    )
 
 
 def _admit_trials(ledger: Ledger, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:

@@ -45,6 +45,20 @@ def test_solving_a_viewing_graph_alone(database_path: Path) -> None:
     assert "28 edges: kept" in output
 
 
+def test_pose_graph_from_a_file(tmp_path: Path) -> None:
+    information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4e9 0 0 4e9 0 4e9"
+    corners = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    lines = [f"VERTEX_SE3:QUAT {k} {x} {y} 0 0 0 0 1" for k, (x, y) in enumerate(corners)]
+    steps = [(0, 1, "1.1 0 0"), (1, 2, "0 1 0"), (2, 3, "-1 0 0"), (3, 0, "0 -1 0")]
+    lines += [f"EDGE_SE3:QUAT {i} {j} {step} 0 0 0 1 {information}" for i, j, step in steps]
+    path = tmp_path / "square.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    for flags in ([], ["--full_information"]):
+        output = run(ROOT / "examples" / "pose_graph_g2o.py", path, *flags)
+        # A tenth of a metre is spread over four sides of equal certainty; rotations are all but certain.
+        assert "4 poses, 4 edges: converged, cost 0.0025," in output
+
+
 def test_swapping_the_mapper(database_path: Path, tmp_path: Path) -> None:
     output = run(ROOT / "examples" / "swap_global_mapping.py", database_path, tmp_path, tmp_path / "out")
     assert "view_graph_mapping model 0: 8 images" in output

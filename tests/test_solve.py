@@ -197,3 +197,24 @@ def test_same_bits_again():
     a, b = solve_view_graph(scene.graph), solve_view_graph(scene.graph)
     assert a.projection_centers.tobytes() == b.projection_centers.tobytes()
     assert a.cam_from_world_rotations.tobytes() == b.cam_from_world_rotations.tobytes()
+
+
+def test_rotations_are_certified_on_request():
+    scene = ring_scene(25, 6, rotation_sigma=0.02, direction_sigma=0.02, seed=3)
+    plain = solve_view_graph(scene.graph, SolveOptions(method="1C", **PAPER))
+    assert not plain.caveats
+    assert all(entry.stage != "certificate" for entry in plain.log)
+    solution = solve_view_graph(scene.graph, SolveOptions(method="1C", certify_rotations=True, **PAPER))
+    assert solution.projection_centers.tobytes() == plain.projection_centers.tobytes()
+    (said,) = solution.caveats
+    assert "are the global optimum" in said
+    (entry,) = [entry for entry in solution.log if entry.stage == "certificate"]
+    rotations = [entry for entry in solution.log if entry.stage == "rotations"]
+    assert abs(entry.change) < 1e-8
+    assert entry.cost == pytest.approx(rotations[-1].cost, rel=1e-6)
+
+
+def test_a_certificate_needs_chordal_rotations():
+    scene = ring_scene(25, 6, seed=3)
+    solution = solve_view_graph(scene.graph, SolveOptions(method="1C", certify_rotations=True))
+    assert "not certified" in solution.caveats[0]

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from colmap_vg import align_positions
 from colmap_vg.datasets.g2o import read_g2o
@@ -195,8 +196,38 @@ def test_information_of_another_shape_is_refused():
         solve_pose_graph(6, edges, relative, translations, R, p, information=np.zeros((3, 6, 6)))
 
 
+def _noise_free_sphere(path):
+    """Edges, relative rotations and translations of a file of ``EDGE3 i j x y z roll pitch yaw`` lines."""
+    rows = np.array([line.split()[1:9] for line in path.read_text().splitlines() if line.startswith("EDGE3")], float)
+    cam1_from_cam2 = Rotation.from_euler("ZYX", rows[:, [7, 6, 5]]).as_matrix()
+    return rows[:, :2].astype(int), np.swapaxes(cam1_from_cam2, 1, 2), rows[:, 2:5]
+
+
 @pytest.mark.real_data
-@pytest.mark.parametrize("name", ["smallGrid3D", "parking-garage"])
+def test_sphere2500_against_its_noise_free_truth(data_folder):
+    folder = data_folder / "view_graphs" / "pose_graphs"
+    edges, relative, translations = _noise_free_sphere(folder / "sphere2500_groundtruth.txt")
+    n = edges.max() + 1
+    R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+    for k in np.flatnonzero(edges[:, 1] == edges[:, 0] + 1):  # chained, in order
+        i, j = edges[k]
+        R[j], p[j] = relative[k] @ R[i], p[i] + R[i].T @ translations[k]
+    graph = read_g2o(folder / "sphere2500.g2o")
+    kappa, tau = graph.chordal_weights()
+    measured = graph.edges, graph.cam2_from_cam1_rotations, graph.cam2_in_cam1_translations
+    noisy = average_rotations_chordal(n, measured[0], measured[1], kappa).cam_from_world_rotations
+    result = solve_pose_graph(n, *measured, noisy, graph.projection_centers, kappa, tau)
+    radius = np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1)))
+    errors, _ = align_positions(result.projection_centers, p)
+    assert np.median(errors) < 0.03 * radius
+    exact = solve_pose_graph(n, edges, relative, translations, *_perturbed_start(R, p, 0.1))
+    # The file holds six digits: its loops do not close better.
+    assert align_positions(exact.projection_centers, p)[0].max() < 1e-3 * radius
+    assert exact.cost < 1e-6
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("name", ["smallGrid3D", "parking-garage", "sphere2500"])
 def test_minimum_of_gtsam(name, data_folder):
     gtsam = pytest.importorskip("gtsam")
     graph = read_g2o(data_folder / "view_graphs" / "pose_graphs" / f"{name}.g2o")
