@@ -24,6 +24,8 @@ IntArray = NDArray[np.int64]
 Layout = Literal["street", "ring", "clusters", "collinear"]
 MEDIAN_INLIERS = 80.0
 """Matches of the median edge; spread log-normally, as in real databases, by a factor of e^0.8."""
+MIN_STATED_SIGMA_DEG = 1e-3
+"""Least standard deviation in the graph's information matrices: exact edges would know infinitely much."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ def scene_on_topology(
     Returns
     -------
     SyntheticScene
-        `outlier` marks random outliers and edges of false clusters.
+        `outlier` marks random outliers and edges of false clusters. The graph's `edge_information` is that of the true
+        noise; outliers state it, too.
 
     Raises
     ------
@@ -163,12 +166,15 @@ def _measured(R: Array, p: Array, edges: IntArray, noise: TopologyNoise, rng: np
     random &= ~false
     relative[random] = so3.random(int(random.sum()), rng)
     direction[random] = normalized(rng.standard_normal((int(random.sum()), 3)))
+    least = np.radians(MIN_STATED_SIGMA_DEG)
+    precisions = np.stack([np.maximum(rotation_sigma, least)] * 3 + [np.maximum(direction_sigma, least)] * 2, 1) ** -2.0
     graph = ViewGraph(
         image_ids=np.arange(1, len(p) + 1),
         edges=edges,
         cam2_from_cam1_rotations=so3.project(relative),
         cam2_in_cam1_directions=normalized(direction),
         num_inliers=inliers,
+        edge_information=precisions[:, :, None] * np.eye(5),
     )
     return SyntheticScene(graph, R, p, random | false)
 

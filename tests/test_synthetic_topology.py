@@ -111,3 +111,15 @@ def test_bad_options_are_refused():
         scene_on_topology(*_band(), layout="spiral")
     with pytest.raises(OptionError, match="between 0 and 1"):
         scene_on_topology(*_band(), noise=TopologyNoise(outlier_share=1.5))
+
+
+def test_information_is_that_of_the_noise():
+    n, edges = _band()
+    truth = scene_on_topology(n, edges, noise=EXACT, seed=2).graph
+    scene = scene_on_topology(n, edges, noise=TopologyNoise(rotation_deg=0.5, direction_deg=1.0), seed=2)
+    graph = scene.graph
+    turn = so3.angle(graph.cam2_from_cam1_rotations @ np.swapaxes(truth.cam2_from_cam1_rotations, 1, 2))
+    apart = np.linalg.norm(np.cross(graph.cam2_in_cam1_directions, truth.cam2_in_cam1_directions), axis=1)
+    # Whitened, the squares of three and of two normal deviates.
+    assert np.mean(turn**2 * graph.edge_information[:, 0, 0]) == pytest.approx(3.0, rel=0.15)
+    assert np.mean(apart**2 * graph.edge_information[:, 3, 3]) == pytest.approx(2.0, rel=0.15)
