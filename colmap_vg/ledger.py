@@ -49,9 +49,14 @@ class Ledger:
         """Edges that no test has dropped so far, (m,)."""
         return np.isin(self.edge_verdicts.astype(str), [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
 
+    @property
+    def trusted(self) -> BoolArray:
+        """Edges that no test may drop, (m,)."""
+        return np.zeros(self.graph.num_edges, dtype=bool) if self.graph.trusted is None else self.graph.trusted
+
     def drop(self, edge_rows: IntArray, verdict: EdgeVerdict) -> None:
-        """Drop edges for a reason."""
-        self.edge_verdicts[edge_rows] = verdict
+        """Drop edges for a reason, but for trusted ones."""
+        self.edge_verdicts[edge_rows[~self.trusted[edge_rows]]] = verdict
 
     def restore(self, edge_rows: IntArray) -> None:
         """Take dropped edges back."""
@@ -120,8 +125,13 @@ class Ledger:
         self.image_verdicts[component == 0] = ImageVerdict.REGISTERED
         self.image_verdicts[component > 0] = ImageVerdict.OTHER_MODEL
         ends = component[self.graph.edges]
-        self.drop(np.flatnonzero(self.usable & ((ends[:, 0] < 0) | (ends[:, 0] != ends[:, 1]))), EdgeVerdict.OUTSIDE)
+        inside = (ends[:, 0] >= 0) & (ends[:, 0] == ends[:, 1])
+        # What only told rotations keeps its word: that may be why its images are outside.
+        self.edge_verdicts[(self.edge_verdicts == EdgeVerdict.KEPT) & ~inside] = EdgeVerdict.OUTSIDE
         status, message = described(self.image_verdicts, self._converged)
+        still = int((self.edge_verdicts == EdgeVerdict.ROTATION_ONLY).sum())
+        if status == SolutionStatus.UNSOLVABLE and still:
+            message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have turned on the spot."
         return PoseSolution(
             image_ids=self.graph.image_ids,
             cam_from_world_rotations=self._R,
@@ -129,7 +139,7 @@ class Ledger:
             registered=component == 0,
             component=component,
             focal_scales=self._focal_scales,
-            edge_kept=self.usable,
+            edge_kept=self.usable & inside,
             edge_verdicts=self.edge_verdicts.astype(str),
             image_verdicts=self.image_verdicts.astype(str),
             status=status,

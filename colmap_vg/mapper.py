@@ -28,12 +28,14 @@ from colmap_vg.output_folder import publish_models, refuse_models, stage_models,
 from colmap_vg.solution import PoseSolution
 from colmap_vg.solve import solve_view_graph
 from colmap_vg.stages import StageEvent, StageLog
-from colmap_vg.verdicts import ImageVerdict, SolutionStatus
+from colmap_vg.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
 from colmap_vg.view_graph import ViewGraph
 
 SAME_LENS_COST = 0.8
 """Share of its cost that bundle adjustment must leave when cameras that shared a calibration get their own: 0.98 to
 0.99 was left where there was one lens and images were strong, 0.89 where they were weak."""
+FALSE_PAIRS = (EdgeVerdict.EXCLUDED, EdgeVerdict.ROTATION_OUTLIER)
+"""Pairs whose matches are kept out of the points: a rotation that far off is not one of noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +164,10 @@ def _build(
     """Models of all components that the points support, the one with most images first."""
     refined = options.ba_refine_focal_length or options.ba_refine_principal_point or options.ba_refine_extra_params
     shared = shared_cameras(graph) if options.share_cameras and refined else []
+    false = np.isin(solution.edge_verdicts, FALSE_PAIRS)
+    without = [(int(a), int(b)) for a, b in graph.image_ids[graph.edges[false]]]
     with log.stage("load"):
-        with loaded_cache(database_path, work, options.read.min_num_inliers, shared) as (cache, replaced):
+        with loaded_cache(database_path, work, options.read.min_num_inliers, shared, without) as (cache, replaced):
             components = range(int(solution.component.max()) + 1)
             posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
         if replaced:
@@ -178,7 +182,10 @@ def _build(
             count = int((solution.component == component).sum())
             log.warn(f"{count} images that seemed a model of their own share no points that could fix them.")
     if models and replaced:
-        with log.stage("cameras"), loaded_cache(database_path, work, options.read.min_num_inliers) as (cache, _):
+        with (
+            log.stage("cameras"),
+            loaded_cache(database_path, work, options.read.min_num_inliers, without_pairs=without) as (cache, _),
+        ):
             models = [
                 replace(m, reconstruction=_on_own_cameras(cache, m.reconstruction, replaced, options, log))
                 for m in models

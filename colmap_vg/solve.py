@@ -118,6 +118,7 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
         result = average(part.num_images, part.edges, relative, weights)
         rotations = result.cam_from_world_rotations
         bad = rotation_residuals(part.edges, relative, rotations) > np.radians(options.rotation_gate_deg)
+        bad &= ~ledger.trusted[part.edge_rows]
         if options.rotation_gate_deg == 0.0 or not bad.any():
             ledger.log.extend(result.log)
             if options.certify_rotations:

@@ -29,6 +29,7 @@ class EdgeVerdict(Verdict):
     DEGENERATE = "degenerate", "COLMAP found no geometry that explains the matches"
     WATERMARK = "watermark", "the matches move as an overlay does, not as a scene does"
     FEW_INLIERS = "few_inliers", "fewer verified matches than `min_num_inliers`"
+    EXCLUDED = "excluded", "on the user's list of pairs not to be used"
     UNCALIBRATED = (
         "uncalibrated",
         "explained by a fundamental matrix only, although the focal lengths are known, and confirmed by nothing else",

@@ -56,6 +56,8 @@ class ViewGraph:
         Whether that focal length was given (calibrated, or from EXIF and not contradicted), not found by us.
     read_verdicts : (m,) str array or None
         `EdgeVerdict` words given on reading; edges other than ``kept`` and ``rotation_only`` are not solved with.
+    trusted : (m,) bool array or None
+        Edges that no filter may drop, on the user's word.
     planar : (m,) bool array or None
         Pairs explained by a homography; their relative pose is less certain.
     triangulation_angles : (m,) array or None
@@ -82,6 +84,7 @@ class ViewGraph:
     camera_focal_lengths: Array | None = field(default=None, kw_only=True)
     camera_focal_known: BoolArray | None = field(default=None, kw_only=True)
     read_verdicts: NDArray[np.str_] | None = field(default=None, kw_only=True)
+    trusted: BoolArray | None = field(default=None, kw_only=True)
     planar: BoolArray | None = field(default=None, kw_only=True)
     triangulation_angles: Array | None = field(default=None, kw_only=True)
     edge_information: Array | None = field(default=None, kw_only=True)
@@ -143,6 +146,7 @@ class ViewGraph:
             "camera_focal_lengths": (c,),
             "camera_focal_known": (c,),
             "read_verdicts": (m,),
+            "trusted": (m,),
             "planar": (m,),
             "triangulation_angles": (m,),
             "edge_information": (m, 5, 5),
@@ -200,6 +204,7 @@ _KINDS: dict[str, type] = {
     "camera_focal_lengths": np.float64,
     "camera_focal_known": np.bool_,
     "read_verdicts": np.str_,
+    "trusted": np.bool_,
     "planar": np.bool_,
     "triangulation_angles": np.float64,
     "edge_information": np.float64,

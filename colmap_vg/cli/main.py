@@ -85,6 +85,12 @@ ShareCameras = Annotated[
 ]
 NumThreads = Annotated[int, typer.Option(*colmap_flags.NUM_THREADS, help="-1: all cores.")]
 RandomSeed = Annotated[int, typer.Option(*colmap_flags.RANDOM_SEED, help="Same seed and threads, same result.")]
+ExcludedPairs = Annotated[
+    Path | None, typer.Option("--excluded_pairs_path", help="Text file, two image names a line: pairs not to be used.")
+]
+TrustedPairs = Annotated[
+    Path | None, typer.Option("--trusted_pairs_path", help="The same: pairs that no filter may drop.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the models that the output folder holds.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Reuse the finished stages of an interrupted run.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")]
@@ -119,6 +125,8 @@ def run(
     rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
     edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
     trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    excluded_pairs_path: ExcludedPairs = None,
+    trusted_pairs_path: TrustedPairs = None,
     min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
     ba_refine_focal_length: RefineFocalLength = "1",
     ba_refine_principal_point: RefinePrincipalPoint = "0",
@@ -147,7 +155,9 @@ def run(
             random_seed=_seed(random_seed),
         )
         options = _mapping_options(
-            _read_options(trust_focal_lengths, min_num_matches, num_threads, random_seed),
+            _read_options(
+                trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, num_threads, random_seed
+            ),
             _solve_options(
                 method,
                 rotation_averaging,
@@ -183,6 +193,8 @@ def mapper(
     rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
     edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
     trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    excluded_pairs_path: ExcludedPairs = None,
+    trusted_pairs_path: TrustedPairs = None,
     min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
     ba_refine_focal_length: RefineFocalLength = "1",
     ba_refine_principal_point: RefinePrincipalPoint = "0",
@@ -209,7 +221,9 @@ def mapper(
         raise typer.BadParameter(str(error)) from None
     with _job(quiet, verbose) as reporter:
         options = _mapping_options(
-            _read_options(trust_focal_lengths, min_num_matches, num_threads, random_seed),
+            _read_options(
+                trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, num_threads, random_seed
+            ),
             _solve_options(
                 method,
                 rotation_averaging,
@@ -245,6 +259,8 @@ def solve(
     rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
     edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
     trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    excluded_pairs_path: ExcludedPairs = None,
+    trusted_pairs_path: TrustedPairs = None,
     min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
     ba_refine_focal_length: RefineFocalLength = "1",
     num_threads: NumThreads = -1,
@@ -256,7 +272,9 @@ def solve(
 ) -> None:
     """The viewing graph only: OUT/0 holds poses without points."""
     with _job(quiet, verbose) as reporter:
-        read = _read_options(trust_focal_lengths, min_num_matches, num_threads, random_seed)
+        read = _read_options(
+            trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, num_threads, random_seed
+        )
         options = _solve_options(
             method,
             rotation_averaging,
@@ -357,8 +375,17 @@ def _seed(random_seed: int) -> int:
     return 0 if random_seed == -1 else random_seed  # COLMAP's -1 asks for its default
 
 
-def _read_options(trust_focal_lengths: str, min_num_matches: int, num_threads: int, random_seed: int) -> ReadOptions:
+def _read_options(
+    trust_focal_lengths: str,
+    min_num_matches: int,
+    excluded_pairs_path: Path | None,
+    trusted_pairs_path: Path | None,
+    num_threads: int,
+    random_seed: int,
+) -> ReadOptions:
     return ReadOptions(
+        excluded_pairs_path=excluded_pairs_path,
+        trusted_pairs_path=trusted_pairs_path,
         min_num_inliers=min_num_matches,
         trust_focal_lengths=trust_focal_lengths,  # type: ignore[arg-type]
         num_threads=num_threads,

@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, with_focal_scale
 from colmap_vg.colmap_io.focals import FocalDecision, decide_focal_lengths
+from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.relative_poses import relative_poses
 from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
 from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
 from colmap_vg.two_view.segments import evenly_thinned, segment_subset
+from colmap_vg.verdicts import EdgeVerdict
 from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
@@ -59,6 +61,12 @@ def _graph(tables: DatabaseTables, focals: FocalDecision, options: ReadOptions) 
         tables, focals.scales, focals.known, offsets, bearings1, bearings2, options.min_num_inliers
     )
     num_inliers = np.diff(offsets)
+    excluded = listed_edges(options.excluded_pairs_path, tables.image_names, tables.pairs)
+    trusted = listed_edges(options.trusted_pairs_path, tables.image_names, tables.pairs) & ~excluded
+    # A trusted pair needs no confirmation of its fundamental matrix.
+    doubted = trusted & (geometry.verdicts == EdgeVerdict.UNCALIBRATED)
+    verdicts = np.where(excluded, str(EdgeVerdict.EXCLUDED), geometry.verdicts)
+    verdicts = np.where(doubted, str(EdgeVerdict.KEPT), verdicts)
     thin = evenly_thinned(offsets, options.max_num_inliers_per_edge)
     return ViewGraph(
         image_ids=tables.image_ids,
@@ -71,7 +79,8 @@ def _graph(tables: DatabaseTables, focals: FocalDecision, options: ReadOptions) 
         camera_ids=np.array([c.camera_id for c in cameras], dtype=np.int64),
         camera_focal_lengths=np.array([c.mean_focal_length() for c in cameras]),
         camera_focal_known=focals.known,
-        read_verdicts=geometry.verdicts,
+        read_verdicts=verdicts,
+        trusted=trusted if trusted.any() else None,
         planar=geometry.planar,
         triangulation_angles=geometry.angles,
         edge_information=geometry.information,

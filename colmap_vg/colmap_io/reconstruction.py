@@ -2,7 +2,7 @@
 
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from os import PathLike
 from pathlib import Path
 
@@ -23,6 +23,7 @@ def loaded_cache(
     work_folder: Path,
     min_num_matches: int,
     shared: Sequence[Sequence[int]] = (),
+    without_pairs: Sequence[tuple[int, int]] = (),
 ) -> Iterator[tuple["pycolmap.DatabaseCache", dict[int, int]]]:
     """COLMAP's view of a database, read from a copy that is gone afterwards: opening a database changes the file.
 
@@ -34,6 +35,8 @@ def loaded_cache(
     min_num_matches : int
     shared : sequence of sequence of int
         Cameras to be merged, see `merge_cameras`.
+    without_pairs : sequence of (int, int)
+        Image ids of pairs whose matches are left out.
 
     Yields
     ------
@@ -50,6 +53,8 @@ def loaded_cache(
     try:
         try:
             replaced: dict[int, int] = {}
+            if without_pairs:
+                _delete_pairs(copy, without_pairs)
             if shared:
                 pycolmap.Database.open(copy).close()  # an old schema becomes the current one
                 replaced = merge_cameras(copy, shared)
@@ -62,6 +67,12 @@ def loaded_cache(
     finally:
         for leftover in work_folder.glob(copy.name + "*"):
             leftover.unlink()
+
+
+def _delete_pairs(copy: Path, pairs: Sequence[tuple[int, int]]) -> None:
+    pair_ids = [(pycolmap.image_pair_to_pair_id(*pair),) for pair in pairs]
+    with closing(sqlite3.connect(copy)) as connection, connection:
+        connection.executemany("DELETE FROM two_view_geometries WHERE pair_id = ?", pair_ids)
 
 
 def reconstruction_from_solution(

@@ -1,0 +1,63 @@
+"""Lists of image pairs from the user: pairs to leave out, and pairs to keep whatever contradicts them."""
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.errors import DataFileError
+
+
+def read_pair_list(path: str | PathLike[str]) -> list[tuple[str, str]]:
+    """Pairs of image names, two names a line as COLMAP's match lists have them; a tab lets names hold spaces.
+
+    Parameters
+    ----------
+    path : path
+        Empty lines and lines that start with ``#`` are skipped.
+
+    Returns
+    -------
+    list of (str, str)
+
+    Raises
+    ------
+    DataFileError
+        The file cannot be read, or a line does not hold two names.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    except OSError as error:
+        raise DataFileError(f"cannot read the list of pairs {path}: {error.strerror}") from error
+    pairs = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.startswith("#"):
+            names = [name.strip() for name in line.split("\t")] if "\t" in line else line.split()
+            if len(names) != 2:
+                raise DataFileError(f"{path}, line {number}: two image names expected, found {line.strip()!r}")
+            pairs.append((names[0], names[1]))
+    return pairs
+
+
+def listed_edges(path: str | PathLike[str] | None, names: Sequence[str], edges: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which edges (m, 2) a list of pairs names, in either order: (m,).
+
+    Raises
+    ------
+    DataFileError
+        As :func:`read_pair_list`, or a name is no image of the database. Pairs without verified matches are ignored.
+    """
+    listed = np.zeros(len(edges), dtype=bool)
+    if path is None:
+        return listed
+    row_of = {name: row for row, name in enumerate(names)}
+    pairs = read_pair_list(path)
+    unknown = sorted({name for pair in pairs for name in pair if name not in row_of})
+    if unknown:
+        raise DataFileError(f"{path}: {len(unknown)} names are no images of the database (first: {unknown[0]!r})")
+    keys = np.array([sorted((row_of[a], row_of[b])) for a, b in pairs], dtype=np.int64).reshape(-1, 2)
+    n = len(names)
+    own = np.sort(edges, axis=1)
+    return np.asarray(np.isin(own[:, 0] * n + own[:, 1], keys[:, 0] * n + keys[:, 1]))
