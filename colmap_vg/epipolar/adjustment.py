@@ -10,7 +10,9 @@ each edge's normal equations by its five or seven parameters are carried to its 
 The robust scale shrinks in steps, down to the noise of the matches. A step is taken only where it lowers the true cost.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -234,7 +236,7 @@ def gauged(centers: Array) -> Array:
 def cost_and_gradient(problem: EpipolarProblem, cameras: Cameras, scale_px: float) -> tuple[float, Array]:
     """Half the Cauchy cost, and its gradient (6 n + f,) as `Cameras.moved` takes steps."""
     terms = _terms(problem, cameras, scale_px)
-    return sum(float(t.costs.sum()) for t in terms) / 2.0, _system(problem).gradient(terms)
+    return _total(terms) / 2.0, _system(problem).gradient(terms)
 
 
 def _system(problem: EpipolarProblem) -> NormalSystem:
@@ -306,14 +308,16 @@ def _minimized(
     """Cameras at the minimum for one scale, the cost, and whether the cost stood still."""
     system, damping = _system(problem), 1e-4
     terms = _terms(problem, cameras, scale)
-    before = sum(float(t.costs.sum()) for t in terms)
+    before = _total(terms)
     for iteration in range(max_num_iterations):
-        gradient = system.gradient(terms)
-        while True:
+        gradient, ahead = system.gradient(terms), None
+        for attempt in count():
             step = system.step(terms, gradient, damping)
             if step is not None:
                 trial = cameras.moved(step, system.free)
-                cost = _cost(problem, trial, scale)
+                # A first step is nearly always taken: the derivatives that come next tell its cost by the way.
+                ahead = _terms(problem, trial, scale) if attempt == 0 else None
+                cost = _total(ahead) if ahead is not None else _cost(problem, trial, scale)
                 if cost < before:
                     break
             damping *= 10.0
@@ -326,5 +330,9 @@ def _minimized(
             return cameras, cost, True
         if _ran_away(cameras):
             break
-        terms = _terms(problem, cameras, scale)
+        terms = ahead if ahead is not None else _terms(problem, cameras, scale)
     return cameras, before, False
+
+
+def _total(terms: Sequence[CameraTerms]) -> float:
+    return sum(float(t.costs.sum()) for t in terms)

@@ -136,12 +136,11 @@ def normal_equations(
     costs, products, slopes = np.zeros(m), np.zeros((m, b, b + 1)), np.ones(m)
     for block, at in _by_block(matches, R, d):
         ratio = at.r * at.r / squared_scales[at.edge][:, None]
-        columns = _jacobian_and_residuals(at, with_focals)
         weights = 1.0 / (1.0 + ratio)
         slopes[block.segments] = _mean_slopes(matches.pieces, block, weights)
-        weighted = columns[:, :b] * weights[:, None]
+        columns = _jacobian_and_residuals(at, with_focals, np.sqrt(weights))
         costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
-        products[block.segments] = block.totals(weighted @ np.swapaxes(columns, 1, 2))
+        products[block.segments] = block.totals(columns[:, :b] @ np.swapaxes(columns, 1, 2))
     hessians = products[:, :, :b]
     # Both triangles were summed; their last digits differ.
     hessians = 0.5 * (hessians + np.swapaxes(hessians, 1, 2))
@@ -169,9 +168,13 @@ def derivatives_by_block(
     pieces = matches.pieces
     for block, at in _by_block(matches, R, d):
         rays = []
+        columns = pieces.columns[block.pieces]
+        x1, x2 = columns[:, :3], columns[:, 3:]
+        if matches.shrinks is not None:
+            x1, x2 = (shrunk(x, factor[at.edge]) for x, factor in zip((x1, x2), matches.shrinks, strict=True))
         for Q, x, first, second, v in (
-            (at.Q1, at.x1, -at.z[1], at.z[0], at.v1),
-            (at.Q2, at.x2, at.y[1], -at.y[0], at.v2),
+            (at.Q1, x1, -at.z[1], at.z[0], at.v1),
+            (at.Q2, x2, at.y[1], -at.y[0], at.v2),
         ):
             line = np.stack([Q[:, a, 0, None] * first + Q[:, a, 1, None] * second for a in range(3)])
             rays.append(pieces.rows((line - at.c * np.moveaxis(x, 1, 0)) * np.sqrt(v / at.variance), block))
@@ -189,15 +192,15 @@ def derivatives_by_block(
 class _AtFrames:
     """Coordinates of a block's matches in their edges' frames, and what is made of them.
 
-    Of each match (pieces, length), with rays x as (pieces, 3, length) and turned ones y and z as (3, pieces, length);
-    of each piece its edge (pieces,), frames (pieces, 3, 3) and variances (pieces, 1).
+    Of each match (pieces, length), vectors (3, pieces, length); of each piece its edge (pieces,), frames (pieces, 3, 3)
+    and variances (pieces, 1). Depths are the rays' third coordinates in their cameras.
     """
 
     edge: IntArray
     Q1: Array
     Q2: Array
-    x1: Array
-    x2: Array
+    depth1: Array
+    depth2: Array
     y: Array
     z: Array
     v1: Array
@@ -217,28 +220,42 @@ def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -
     edge = matches.pieces.segments[block.pieces]
     Q1, Q2 = frames1[edge], frames2[edge]
     columns = matches.pieces.columns[block.pieces]
-    x1, x2 = columns[:, :3], columns[:, 3:]
-    if matches.shrinks is not None:
-        x1, x2 = (shrunk(x, factor[edge]) for x, factor in zip((x1, x2), matches.shrinks, strict=True))
-    y, z = (np.moveaxis(np.swapaxes(Q, 1, 2) @ x, 1, 0) for Q, x in ((Q1, x1), (Q2, x2)))
+    shrinks = (None, None) if matches.shrinks is None else matches.shrinks[:, edge]
+    y, depth1 = _turned(Q1, columns[:, :3], shrinks[0])
+    z, depth2 = _turned(Q2, columns[:, 3:], shrinks[1])
     v1, v2 = matches.variances[:, edge, None]
     c = z[0] * y[1] - z[1] * y[0]
     squared = c * c
     # 1 - y_3^2 without cancellation near the epipole; the floor keeps a match on both epipoles finite.
     variance = (y[0] * y[0] + y[1] * y[1] - squared) * v2 + (z[0] * z[0] + z[1] * z[1] - squared) * v1
     np.maximum(variance, 1e-12 * (v1 + v2), out=variance)
-    return _AtFrames(edge, Q1, Q2, x1, x2, y, z, v1, v2, c, variance, c / np.sqrt(variance))
+    return _AtFrames(edge, Q1, Q2, depth1, depth2, y, z, v1, v2, c, variance, c / np.sqrt(variance))
 
 
-def _jacobian_and_residuals(at: _AtFrames, with_focals: bool) -> Array:
+def _turned(Q: Array, x: Array, shrink: Array | None) -> tuple[Array, Array]:
+    """Coordinates ``Q^T x`` (3, pieces, length) of unit rays (pieces, 3, length), shrunk where asked, and depths."""
+    depth = x[:, 2]
+    if shrink is None:
+        return np.moveaxis(np.swapaxes(Q, 1, 2) @ x, 1, 0), depth
+    # Shrinking goes with the frame, and the length is that of a ray that was of length one.
+    factors = np.stack([shrink, shrink, np.ones_like(shrink)], axis=1)
+    squared = np.square(shrink)[:, None]
+    inverse = 1.0 / np.sqrt(squared + (1.0 - squared) * (depth * depth))
+    turned = np.swapaxes(Q * factors[:, :, None], 1, 2) @ x
+    turned *= inverse[:, None]
+    return np.moveaxis(turned, 1, 0), depth * inverse
+
+
+def _jacobian_and_residuals(at: _AtFrames, with_focals: bool, weights: Array | float = 1.0) -> Array:
     """Derivatives of the residuals, 5 or with the focal lengths 7, and the residuals: (pieces, 6 or 8, length).
 
     With ``c'`` the slope of the constraint and ``h + c c' (-v_1 - v_2)`` half that of s^2:
-    ``r' = c' (1 / s + r c (v_1 + v_2) / s^2) - h r / s^2``.
+    ``r' = c' (1 / s + r c (v_1 + v_2) / s^2) - h r / s^2``. All of it is multiplied by the weights (pieces, length).
     """
     y, z, c = at.y, at.z, at.c
     bend = at.r / at.variance
-    gain = 1.0 / np.sqrt(at.variance) + bend * c * (at.v1 + at.v2)
+    gain = (1.0 / np.sqrt(at.variance) + bend * c * (at.v1 + at.v2)) * weights
+    bend *= weights
     bend1, bend2 = bend * at.v1, bend * at.v2
     along1, along2 = bend2 * y[2], bend1 * z[2]
     J = np.empty((len(c), 8 if with_focals else 6, c.shape[1]))
@@ -248,7 +265,7 @@ def _jacobian_and_residuals(at: _AtFrames, with_focals: bool) -> Array:
     J[:, 3] = gain * (z[1] * y[2] - z[2] * y[1]) + along1 * y[0] + along2 * z[0]
     J[:, 4] = gain * (z[2] * y[0] - z[0] * y[2]) + along1 * y[1] + along2 * z[1]
     if with_focals:
-        depth1, depth2 = at.x1[:, 2], at.x2[:, 2]
+        depth1, depth2 = at.depth1, at.depth2
         dy = [depth1 * (at.Q1[:, 2, b, None] - depth1 * y[b]) for b in range(2)]
         dz = [depth2 * (at.Q2[:, 2, b, None] - depth2 * z[b]) for b in range(2)]
         squared = c * c
@@ -256,5 +273,5 @@ def _jacobian_and_residuals(at: _AtFrames, with_focals: bool) -> Array:
         J[:, 5] -= (y[0] * dy[0] + y[1] * dy[1]) * bend2 - (z[0] * z[0] + z[1] * z[1] - squared) * bend1
         J[:, 6] = gain * (dz[0] * y[1] - dz[1] * y[0])
         J[:, 6] -= (z[0] * dz[0] + z[1] * dz[1]) * bend1 - (y[0] * y[0] + y[1] * y[1] - squared) * bend2
-    J[:, -1] = at.r
+    J[:, -1] = at.r * weights
     return J
