@@ -186,7 +186,7 @@ def _in_stages(
         else:
             scale = min(scale, max(final_sigmas * _sigma(problem, cameras), _MIN_SIGMA_PX))
         end = tolerance if last else _COARSE * tolerance
-        cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log)
+        cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log, near=stage > 0)
         if _ran_away(cameras):
             break
         away = np.einsum("ka,ka->k", cameras.relative(problem.edges)[1], directions[rows]) < 0.0
@@ -194,7 +194,7 @@ def _in_stages(
             reversed_edges[rows[away]] = True
             problem, rows = problem.without(away), rows[~away]
             if last:
-                cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log)
+                cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log, near=True)
     return AdjustmentResult(
         so3.project(cameras.rotations),
         cameras.centers,
@@ -245,15 +245,16 @@ def _system(problem: EpipolarProblem) -> NormalSystem:
     return NormalSystem(problem.num_images, images, problem.camera_idx, free, len(problem.focal_lengths))
 
 
-def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float) -> list[CameraTerms]:
-    """Robust costs of edges and of triplets with their derivatives by the cameras."""
+def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float, *, near: bool = False) -> list[CameraTerms]:
+    """Robust costs of edges and of triplets with their derivatives by the cameras; Newton's curvature near the end."""
     edges, with_focals = problem.edges, bool(problem.free_focals.any())
     R, d, length = cameras.relative(edges)
     at = normal_equations(
         problem.matches(cameras.log_scales), R, d, np.full(len(edges), scale), with_focals=with_focals
     )
     chain = edge_chain(cameras.rotations[edges[:, 0]], R, d, length)
-    terms = [CameraTerms.chained(edges, at.costs, at.gradients, at.newton_hessians, chain)]
+    hessians = at.newton_hessians if near else at.hessians
+    terms = [CameraTerms.chained(edges, at.costs, at.gradients, hessians, chain)]
     if problem.triplets is not None:
         images = problem.triplets.images
         rays = problem.triplet_rays(problem.triplets, cameras.log_scales)
@@ -303,11 +304,21 @@ def triplet_chain(R_b: Array, poses: TripletPoses) -> Array:
 
 
 def _minimized(
-    problem: EpipolarProblem, cameras: Cameras, scale: float, max_num_iterations: int, end: float, log: list[LogEntry]
+    problem: EpipolarProblem,
+    cameras: Cameras,
+    scale: float,
+    max_num_iterations: int,
+    end: float,
+    log: list[LogEntry],
+    *,
+    near: bool,
 ) -> tuple[Cameras, float, bool]:
-    """Cameras at the minimum for one scale, the cost, and whether the cost stood still."""
+    """Cameras at the minimum for one scale, the cost, and whether the cost stood still.
+
+    Not `near` it, where many matches contradict the cameras, the steps of reweighted least squares are short and sure.
+    """
     system, damping = _system(problem), 1e-4
-    terms = _terms(problem, cameras, scale)
+    terms = _terms(problem, cameras, scale, near=near)
     before = _total(terms)
     for iteration in range(max_num_iterations):
         gradient, ahead = system.gradient(terms), None
@@ -316,7 +327,7 @@ def _minimized(
             if step is not None:
                 trial = cameras.moved(step, system.free)
                 # A first step is nearly always taken: the derivatives that come next tell its cost by the way.
-                ahead = _terms(problem, trial, scale) if attempt == 0 else None
+                ahead = _terms(problem, trial, scale, near=near) if attempt == 0 else None
                 cost = _total(ahead) if ahead is not None else _cost(problem, trial, scale)
                 if cost < before:
                     break
@@ -330,7 +341,7 @@ def _minimized(
             return cameras, cost, True
         if _ran_away(cameras):
             break
-        terms = ahead if ahead is not None else _terms(problem, cameras, scale)
+        terms = ahead if ahead is not None else _terms(problem, cameras, scale, near=near)
     return cameras, before, False
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.pieces import Block, Pieces, shrunk
+from colmap_vg.two_view.pieces import Block, Pieces, shrunk
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -264,7 +264,10 @@ def _jacobian_and_residuals(at: _Tracks, with_focals: bool) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    result = np.empty((3, *np.broadcast_shapes(a.shape[1:], b.shape[1:])))
+    for k in range(3):
+        np.subtract(a[k - 2] * b[k - 1], a[k - 1] * b[k - 2], out=result[k])
+    return result
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletRays
-from colmap_vg.epipolar.pieces import Pieces
 from colmap_vg.epipolar.sampson import Matches, cut_rays
 from colmap_vg.epipolar.triplets import Triplets, find_triplets
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.options import SolveOptions
+from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import rows_of_segments, segment_subset
 from colmap_vg.two_view.spread import well_spread
 from colmap_vg.view_graph import ViewGraph

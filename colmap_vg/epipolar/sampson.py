@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.pieces import Block, Pieces, shrunk
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
+from colmap_vg.two_view.pieces import Block, Pieces, shrunk
 from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.pieces import Pieces
+from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_of_rows, segment_subset, segment_sums
 
 Array = NDArray[np.float64]

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from colmap_vg.robust import cauchy_weight
 from colmap_vg.two_view.essential import nearest_essential
-from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_sums
+from colmap_vg.two_view.pieces import Pieces
+from colmap_vg.two_view.segments import segment_quantiles, segment_sums
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -154,38 +155,58 @@ def _reweighted(
     m = len(offsets) - 1
     result = np.full((m, 3, 3), np.nan) if initial is None else initial.astype(np.float64)
     enough = np.diff(offsets) >= _MIN_MATCHES
-    edge = segment_of_rows(offsets)
-    products = pair_products(points1, points2)
-    weights = np.ones(len(products))
+    pieces = Pieces.cut(offsets, [*points1.T, *points2.T])
     E = np.where(enough[:, None, None], np.nan_to_num(result), np.eye(3))
+    weights = np.ones((len(pieces.counts), pieces.columns.shape[2]))
     if initial is not None:
-        weights = _sampson_weights(E, offsets, edge, points1, points2, min_scale, on_sphere)
+        weights = _sampson_weights(E, pieces, min_scale, on_sphere)
     for iteration in range(num_iterations):
-        moments = moments_from_products(segment_sums(offsets, products, weights))
+        moments = weighted_moments(pieces, weights)
         moments[~enough] = np.eye(9)
         E = _rank_two(matrix_of_least_moment(moments, rank_two=not on_sphere), on_sphere)
         if iteration + 1 < num_iterations:
-            weights = _sampson_weights(E, offsets, edge, points1, points2, min_scale, on_sphere)
+            weights = _sampson_weights(E, pieces, min_scale, on_sphere)
     result[enough] = E[enough]
     return result
 
 
-def _sampson_weights(
-    E: Array, offsets: IntArray, edge: IntArray, points1: Array, points2: Array, min_scale: float, on_sphere: bool
-) -> Array:
-    row_E = E[edge]
-    line2 = np.einsum("kij,kj->ki", row_E, points1)
-    line1 = np.einsum("kij,ki->kj", row_E, points2)
-    algebraic = np.einsum("ki,ki->k", points2, line2)
-    variance = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1)
-    if on_sphere:
-        variance += np.square(line1[:, 2]) + np.square(line2[:, 2]) - 2.0 * np.square(algebraic)
+def weighted_moments(pieces: Pieces, weights: Array) -> Array:
+    """Moments ``sum w (x2 ⊗ x1)(x2 ⊗ x1)^T`` on the row-major ``vec(E)``: (m, 9, 9).
+
+    Parameters
+    ----------
+    pieces : Pieces
+        Three columns of x1 and three of x2.
+    weights : (p, length) array
+    """
+    moments = np.zeros((pieces.num_segments, 9, 9))
+    for block in pieces.blocks():
+        columns = pieces.columns[block.pieces]
+        products = (columns[:, 3:, None] * columns[:, None, :3]).reshape(len(columns), 9, columns.shape[2])
+        weighted = products * weights[block.pieces, None]
+        moments[block.segments] = block.totals(weighted @ np.swapaxes(products, 1, 2))
+    return 0.5 * (moments + np.swapaxes(moments, 1, 2))
+
+
+def _sampson_weights(E: Array, pieces: Pieces, min_scale: float, on_sphere: bool) -> Array:
+    """Cauchy weights of the Sampson errors over their variances: (p, length)."""
+    squared, variance = np.empty((2, len(pieces.counts), pieces.columns.shape[2]))
+    for block in pieces.blocks():
+        columns, E_of = pieces.columns[block.pieces], E[pieces.segments[block.pieces]]
+        line2 = E_of @ columns[:, :3]
+        line1 = np.swapaxes(E_of, 1, 2) @ columns[:, 3:]
+        algebraic = np.square(np.einsum("pak,pak->pk", columns[:, 3:], line2))
+        spread = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1)
+        if on_sphere:
+            spread += np.square(line1[:, 2]) + np.square(line2[:, 2]) - 2.0 * algebraic
+        squared[block.pieces], variance[block.pieces] = algebraic, spread
     # A match beside both epipoles fits whatever its error: without a floor its weight would grow beyond all others.
-    typical = segment_sums(offsets, variance) / np.maximum(np.diff(offsets), 1)
-    variance = np.maximum(variance, 1e-2 * typical[edge] + 1e-300)
-    squared = np.square(algebraic) / variance
-    scale = np.maximum(2.0 * np.sqrt(segment_quantiles(offsets, squared)), min_scale)
-    return np.asarray(cauchy_weight(squared / np.square(scale[edge])) / variance)
+    offsets = pieces.offsets
+    typical = segment_sums(offsets, pieces.rows(variance)) / np.maximum(np.diff(offsets), 1)
+    variance = np.maximum(variance, 1e-2 * typical[pieces.segments, None] + 1e-300)
+    squared /= variance
+    scale = np.maximum(2.0 * np.sqrt(segment_quantiles(offsets, pieces.rows(squared))), min_scale)
+    return np.asarray(cauchy_weight(squared / np.square(scale[pieces.segments, None])) / variance)
 
 
 def _rank_two(E: Array, on_sphere: bool) -> Array:

@@ -10,9 +10,9 @@ from colmap_vg.epipolar.depth_agreement import (
     depth_equations,
     depth_residuals,
 )
-from colmap_vg.epipolar.pieces import Pieces
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
+from colmap_vg.two_view.pieces import Pieces
 
 FOCALS = np.array([900.0, 1000.0, 1150.0])
 

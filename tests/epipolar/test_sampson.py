@@ -83,11 +83,11 @@ def test_derivatives_by_keypoints_are_those_of_finite_differences():
 
 
 def test_the_same_bits_in_blocks_of_any_size(monkeypatch):
-    from colmap_vg.epipolar import pieces
+    from colmap_vg.two_view import pieces
 
     data = matched_rays(4, [30, 700, 260], sigma=0.01)
     costs = []
     for rows in (64, 8192):
-        monkeypatch.setattr(pieces, "_ROWS_PER_BLOCK", rows)
+        monkeypatch.setattr(pieces, "ROWS_PER_BLOCK", rows)
         costs.append(sampson.cauchy_costs(matches_of(data), data.rotations, data.directions, np.ones(3)))
     np.testing.assert_array_equal(*costs)

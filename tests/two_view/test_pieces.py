@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from colmap_vg.epipolar import pieces as module
-from colmap_vg.epipolar.pieces import Pieces, shrunk
 from colmap_vg.geometry.directions import normalized
+from colmap_vg.two_view import pieces as module
+from colmap_vg.two_view.pieces import Pieces, shrunk
 
 COUNTS = st.lists(st.one_of(st.integers(0, 3), st.integers(0, 700)), min_size=1, max_size=12)
 
@@ -29,11 +29,11 @@ def test_pieces_hold_every_row_once_in_order(counts, seed, per_block):
     np.testing.assert_array_equal(np.diff(some.offsets), np.asarray(counts)[chosen])
     parts = [rows[0, a:b] for a, b in itertools.pairwise(offsets)]
     np.testing.assert_array_equal(some.rows(some.columns[:, 0]), np.concatenate([[], *(parts[k] for k in chosen)]))
-    before, module._ROWS_PER_BLOCK = module._ROWS_PER_BLOCK, per_block
+    before, module.ROWS_PER_BLOCK = module.ROWS_PER_BLOCK, per_block
     try:
         blocks = list(pieces.blocks())
     finally:
-        module._ROWS_PER_BLOCK = before
+        module.ROWS_PER_BLOCK = before
     sums, met = np.zeros(len(counts)), np.zeros(len(counts), dtype=int)
     for block in blocks:
         met[block.segments] += 1

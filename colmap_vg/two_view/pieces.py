@@ -19,7 +19,8 @@ IntArray = NDArray[np.int64]
 
 _LENGTHS = (8, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 _ROWS_PER_PIECE = 24  # rows that are computed in the time that a piece costs beside its rows
-_ROWS_PER_BLOCK = 8192  # a column of 64 kB; the thirty of one block share the second-level cache
+ROWS_PER_BLOCK = 8192
+"""A column of 64 kB; the thirty of one block share the second-level cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +78,9 @@ class Pieces:
         pieces, starts = rows_of_segments(self.starts, segments)
         return Pieces(starts, self.counts[pieces], self.columns[pieces])
 
-    def blocks(self) -> Iterator["Block"]:
-        """Runs of whole segments of about `_ROWS_PER_BLOCK` rows."""
-        per_block = max(_ROWS_PER_BLOCK // self.columns.shape[2], 1)
+    def blocks(self, num_rows: int | None = None) -> Iterator["Block"]:
+        """Runs of whole segments of about so many rows."""
+        per_block = max((num_rows or ROWS_PER_BLOCK) // self.columns.shape[2], 1)
         first, last = 0, self.num_segments
         while first < last:
             stop = int(np.searchsorted(self.starts, self.starts[first] + per_block, side="right")) - 1
