@@ -81,6 +81,33 @@ def points_svg(title: str, edges: NDArray[np.int64], truth: Array, points: Mappi
     return _document(title, [*body, *_legend(["truth", *points], LEFT + pixels + 40)])
 
 
+def growth_svg(title: str, label: str, series: Mapping[str, tuple[Array, Array]]) -> str:
+    """Lines of seconds over sizes, both axes logarithmic.
+
+    Parameters
+    ----------
+    title, label : str
+        `label` is the horizontal axis's.
+    series : mapping of name to ((k,) sizes, (k,) seconds)
+    """
+    sizes = np.log10(np.concatenate([a for a, _ in series.values()]))
+    seconds = np.log10(np.concatenate([b for _, b in series.values()]))
+    low, high = float(sizes.min()) - 0.05, float(sizes.max()) + 0.05
+    bottom, top = float(np.floor(seconds.min())), float(np.ceil(seconds.max() + 1e-9))
+    x, y = _Axis(low, high, LEFT, WIDTH - RIGHT - 110), _Axis(bottom, max(top, bottom + 1), HEIGHT - BOTTOM, TOP)
+    body = []
+    for color, (own_sizes, own_seconds) in zip(COLORS, series.values(), strict=False):
+        points = [(x(np.log10(a)), y(np.log10(b))) for a, b in zip(own_sizes, own_seconds, strict=True)]
+        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
+        body.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="1.5"/>')
+        body += [f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{color}"/>' for a, b in points]
+    every = np.unique(np.concatenate([a for a, _ in series.values()]))
+    x_ticks = [(float(np.log10(v)), f"{v:g}") for v in every[:: max(1, len(every) // 5)]]
+    y_ticks = [(d, f"{10.0**d:g}") for d in np.arange(bottom, max(top, bottom + 1) + 1)]
+    body += _axes(x, y, x_ticks, y_ticks, label, "seconds")
+    return _document(title, [*body, *_legend(list(series))])
+
+
 class _Axis:
     """Linear map from a range of values to pixels."""
 

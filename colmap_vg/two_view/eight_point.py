@@ -1,7 +1,6 @@
 """Essential and fundamental matrices of all edges from their matches alone, by robust linear estimation.
 
-The eight-point algorithm on the 9x9 moments ``M = sum w (x2 ⊗ x1)(x2 ⊗ x1)^T`` of each edge. The products of
-``x1 x1^T`` and ``x2 x2^T`` are 6 x 6 = 36 numbers a match, which do not change while weights do. Normalisation
+The eight-point algorithm on the 9x9 moments ``M = sum w (x2 ⊗ x1)(x2 ⊗ x1)^T`` of each edge. Normalisation
 (Hartley, In defense of the eight-point algorithm, 1997) is a whitening of each side, applied to the moments instead of
 the points. Weights are those of the Sampson distance times a Cauchy weight, as in iteratively reweighted algebraic
 fitting (Hartley & Zisserman §11.4.3).
@@ -18,24 +17,8 @@ from colmap_vg.two_view.segments import segment_quantiles, segment_sums
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # position of entry (i, j) among the six distinct ones
-_ROWS, _COLUMNS = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 _MIN_MATCHES = 8
 _NUM_RANK_STEPS = 3  # Newton steps to determinant zero; it converges quadratically
-
-
-def pair_products(points1: Array, points2: Array) -> Array:
-    """The 36 distinct products of ``x2 x2^T`` and ``x1 x1^T`` of each match: (k, 3), (k, 3) to (k, 36)."""
-    first = points1[:, _ROWS] * points1[:, _COLUMNS]
-    second = points2[:, _ROWS] * points2[:, _COLUMNS]
-    return np.asarray((second[:, :, None] * first[:, None, :]).reshape(len(points1), 36))
-
-
-def moments_from_products(products: Array) -> Array:
-    """Moment matrices on the row-major ``vec(E)`` from summed products: (m, 36) to (m, 9, 9)."""
-    second = _SYMMETRIC[:, None, :, None]
-    first = _SYMMETRIC[None, :, None, :]
-    return np.asarray(products[:, 6 * second + first].reshape(len(products), 9, 9))
 
 
 def matrix_of_least_moment(moments: Array, *, rank_two: bool = False) -> Array:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.robust import cauchy_weight
-from colmap_vg.two_view.eight_point import cofactors, moments_from_products, pair_products
-from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_sums
+from colmap_vg.two_view.eight_point import cofactors, weighted_moments
+from colmap_vg.two_view.pieces import Pieces
+from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -77,16 +78,18 @@ def fundamental_covariances(
 
 
 def _information(offsets: IntArray, points1: Array, points2: Array, F: Array, min_sigma: float) -> tuple[Array, Array]:
-    edge = segment_of_rows(offsets)
-    plane1, plane2 = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (points1, points2))
-    row_F = F[edge]
-    line2 = np.einsum("kij,kj->ki", row_F, plane1)
-    line1 = np.einsum("kij,ki->kj", row_F, plane2)
-    variance = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1) + 1e-300
-    squared = np.square(np.einsum("ki,ki->k", plane2, line2)) / variance
+    ones = np.ones(len(points1))
+    pieces = Pieces.cut(offsets, [*points1.T, ones, *points2.T, ones])
+    squared, variance = np.empty((2, len(pieces.counts), pieces.columns.shape[2]))
+    for block in pieces.blocks():
+        columns, F_of = pieces.columns[block.pieces], F[pieces.segments[block.pieces]]
+        line2 = F_of @ columns[:, :3]
+        line1 = np.swapaxes(F_of, 1, 2) @ columns[:, 3:]
+        variance[block.pieces] = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1) + 1e-300
+        squared[block.pieces] = np.square(np.einsum("pak,pak->pk", columns[:, 3:], line2))
+    squared /= variance
     count = np.diff(offsets)
-    median = np.sqrt(segment_quantiles(offsets, squared))
+    median = np.sqrt(segment_quantiles(offsets, pieces.rows(squared)))
     sigma = np.maximum(1.4826 * median * np.sqrt(count / np.maximum(count - 7, 1)), min_sigma)
-    weights = cauchy_weight(squared / np.square(_CAUCHY_SCALE * sigma)[edge]) / variance
-    moments = moments_from_products(segment_sums(offsets, pair_products(plane1, plane2), weights))
-    return moments / np.square(sigma)[:, None, None], sigma
+    weights = cauchy_weight(squared / np.square(_CAUCHY_SCALE * sigma)[pieces.segments, None]) / variance
+    return weighted_moments(pieces, weights) / np.square(sigma)[:, None, None], sigma

@@ -10,17 +10,20 @@ from colmap_vg.geometry import so3
 from colmap_vg.two_view.eight_point import (
     estimate_essential_from_inliers,
     estimate_fundamental_from_inliers,
-    moments_from_products,
-    pair_products,
+    weighted_moments,
 )
 from colmap_vg.two_view.essential import essential_from_pose, poses_from_essential
+from colmap_vg.two_view.pieces import Pieces
 
 
 def test_moments_are_the_outer_products_of_the_constraint_rows():
-    data = matched_rays(0, [9])
-    rows = np.einsum("ki,kj->kij", data.bearings2, data.bearings1).reshape(9, 9)
-    found = moments_from_products(pair_products(data.bearings1, data.bearings2).sum(axis=0)[None])
-    np.testing.assert_allclose(found[0], rows.T @ rows, atol=1e-12)
+    data, weights = matched_rays(0, [9, 40]), np.random.default_rng(0).random(49)
+    rows = np.einsum("ki,kj->kij", data.bearings2, data.bearings1).reshape(49, 9)
+    pieces = Pieces.cut(data.offsets, [*data.bearings1.T, *data.bearings2.T])
+    padded = Pieces.cut(data.offsets, [weights]).columns[:, 0]
+    found = weighted_moments(pieces, padded)
+    np.testing.assert_allclose(found[0], rows[:9].T @ (weights[:9, None] * rows[:9]), atol=1e-12)
+    np.testing.assert_allclose(found[1], rows[9:].T @ (weights[9:, None] * rows[9:]), atol=1e-12)
 
 
 @settings(max_examples=20, deadline=None)
