@@ -186,7 +186,7 @@ def _solve_part(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOpt
         return _solve_directions(ledger, part, poses, options)
     # The adjustment goes on from wherever Alg. 2 is: its last digits would be lost work.
     rough = replace(options, method="2O", max_num_iterations=ROUGH_ITERATIONS, convergence_tolerance=1e-3)
-    return part, _adjust_epipolar(ledger, part, problem, _solve_poses(ledger, part, poses, rough))
+    return _adjust_epipolar(ledger, part, problem, _solve_poses(ledger, part, poses, rough), options)
 
 
 def _solve_directions(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOptions) -> tuple[Subgraph, _Poses]:
@@ -269,8 +269,13 @@ def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOp
     )
 
 
-def _adjust_epipolar(ledger: Ledger, part: Subgraph, problem: EpipolarProblem, poses: _Poses) -> _Poses:
-    """Poses and free focal lengths at the minimum of the epipolar errors; reversed edges leave."""
+def _adjust_epipolar(
+    ledger: Ledger, part: Subgraph, problem: EpipolarProblem, poses: _Poses, options: SolveOptions
+) -> tuple[Subgraph, _Poses]:
+    """Poses and free focal lengths at the minimum of the epipolar errors.
+
+    Reversed edges leave, and with them images that the rest does not fix: those stood on the wrong side of an edge.
+    """
     directions = ledger.graph.cam2_in_cam1_directions[part.edge_rows]
     found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     ledger.log.extend(found.log)
@@ -282,7 +287,10 @@ def _adjust_epipolar(ledger: Ledger, part: Subgraph, problem: EpipolarProblem, p
             f"The matches do not tell the focal length of {count} of {len(group)} cameras; it stays as it was read."
         )
     focal_scales = found.focal_scales[group]
-    return _Poses(found.cam_from_world_rotations, found.projection_centers, focal_scales, found.converged)
+    fixed = ledger.largest_rigid_part(part, options.random_seed) if found.reversed_edges.any() else part
+    rows = part.rows_of(fixed.images)
+    rotations, centers = found.cam_from_world_rotations[rows], found.projection_centers[rows]
+    return fixed, _Poses(rotations, centers, focal_scales, found.converged)
 
 
 def _world_directions(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:

@@ -34,6 +34,7 @@ BoolArray = NDArray[np.bool_]
 _MAX_DAMPING = 1e6  # shares of the Hessian's diagonal
 _SHORTEST_BASELINE = 1e-6  # of the RMS distance of cameras; keeps the direction of coinciding cameras finite
 _COARSE = 300.0  # the next scale moves the cameras more than the last digits of this one
+_MAX_TURN = 0.2  # radians, in one step
 _MAX_LOG_FOCAL_STEP = 0.3
 _MAX_LOG_FOCAL = np.log(3.0)  # cameras with nearly no focal length see anything without an error
 _MIN_SIGMA_PX = 0.05  # pixels; no keypoints are better, and exact data keep a finite scale
@@ -81,13 +82,28 @@ class Cameras:
     centers: Array
     log_scales: Array
 
-    def moved(self, step: Array, free: IntArray) -> "Cameras":
-        """After a step (6 n + f,): w and x of each image, then the free focals' logarithms; gauge put back."""
+    def moved(self, step: Array, free: IntArray, reach: Array | None = None) -> "Cameras":
+        """After a step (6 n + f,): w and x of each image, then the free focals' logarithms; gauge put back.
+
+        No image moves by more than its `reach` (n,), so that what the others gain does not pay for one that jumps.
+        """
         n = len(self.centers)
         poses = step[: 6 * n].reshape(n, 6)
+        if reach is not None:
+            far = np.maximum(
+                np.linalg.norm(poses[:, 3:], axis=1) / reach, np.linalg.norm(poses[:, :3], axis=1) / _MAX_TURN
+            )
+            poses = poses / np.maximum(far, 1.0)[:, None]
         log_scales = self.log_scales.copy()
         log_scales[free] += np.clip(step[6 * n :], -_MAX_LOG_FOCAL_STEP, _MAX_LOG_FOCAL_STEP)
         return Cameras(so3.exp(poses[:, :3]) @ self.rotations, gauged(self.centers + poses[:, 3:]), log_scales)
+
+    def reach(self, edges: IntArray) -> Array:
+        """Half the way from each image to its nearest neighbour in the graph, (n,); no less than of a short edge."""
+        length = np.linalg.norm(self.centers[edges[:, 1]] - self.centers[edges[:, 0]], axis=1)
+        nearest = np.full(len(self.centers), np.inf)
+        np.minimum.at(nearest, edges.ravel(), np.repeat(length, 2))
+        return np.asarray(0.5 * np.maximum(nearest, 0.1 * np.median(length)))
 
     def relative(self, edges: IntArray) -> tuple[Array, Array, Array]:
         """Relative rotations (m, 3, 3), directions (m, 3) and baselines (m,) of edges."""
@@ -321,11 +337,11 @@ def _minimized(
     terms = _terms(problem, cameras, scale, near=near)
     before = _total(terms)
     for iteration in range(max_num_iterations):
-        gradient, ahead = system.gradient(terms), None
+        gradient, reach, ahead = system.gradient(terms), cameras.reach(problem.edges), None
         for attempt in count():
             step = system.step(terms, gradient, damping)
             if step is not None:
-                trial = cameras.moved(step, system.free)
+                trial = cameras.moved(step, system.free, reach)
                 # A first step is nearly always taken: the derivatives that come next tell its cost by the way.
                 ahead = _terms(problem, trial, scale, near=near) if attempt == 0 else None
                 cost = _total(ahead) if ahead is not None else _cost(problem, trial, scale)

@@ -97,7 +97,9 @@ def build_model(
         log.result(_state(reconstruction))
     with log.stage("register"):
         removed = _remove_unsupported(mapper)
-        added = _register_left_out(mapper, options, others | removed)
+        # What left may come back by the points: the graph had it in a wrong place.
+        added = _register_left_out(mapper, options, others)
+        removed -= added
         if added or removed:
             mapper.complete_and_merge_tracks(triangulator)
             _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
