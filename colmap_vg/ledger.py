@@ -104,7 +104,7 @@ class Ledger:
         moved = centers - centers.mean(axis=0)
         self._R[part.images] = so3.project(rotations)
         self._p[part.images] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
-        self._component[part.images] = self._component.max() + 1
+        self._component[part.images] = self._component.max(initial=-1) + 1
         self._converged &= converged
         if self.graph.camera_idx is not None:
             # A camera of two components keeps what the larger one found.
@@ -117,7 +117,7 @@ class Ledger:
     def solution(self) -> PoseSolution:
         """What was placed, in the graph's order; unsolvable when nothing was."""
         component = self._component
-        if component.max() >= 0:
+        if component.max(initial=-1) >= 0:
             sizes = np.bincount(component[component >= 0])
             rank = np.empty(len(sizes), dtype=np.int64)
             rank[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))

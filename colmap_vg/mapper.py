@@ -168,7 +168,7 @@ def _build(
     without = [(int(a), int(b)) for a, b in graph.image_ids[graph.edges[false]]]
     with log.stage("load"):
         with loaded_cache(database_path, work, options.read.min_num_inliers, shared, without) as (cache, replaced):
-            components = range(int(solution.component.max()) + 1)
+            components = range(int(solution.component.max(initial=-1)) + 1)
             posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
         if replaced:
             log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")

@@ -47,9 +47,9 @@ def test_images_that_are_not_registered_have_no_pose(
     solved: tuple[Path, ViewGraph, PoseSolution], tmp_path: Path
 ) -> None:
     path, graph, solution = solved
-    registered = np.array([True, False, True, True, False])
+    component = np.array([0, 1, 0, 0, -1])
     with loaded_cache(path, tmp_path, 15) as (cache, _):
-        model = reconstruction_from_solution(cache, replace(solution, registered=registered), graph)
+        model = reconstruction_from_solution(cache, replace(solution, component=component), graph)
     assert sorted(model.reg_image_ids()) == [1003, 1009, 1012]
     assert model.num_images() == 5
     for image_id in (1006, 1015):
