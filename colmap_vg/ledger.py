@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.edge_residuals import edge_residual_sigmas
 from colmap_vg.geometry import so3
 from colmap_vg.graph.components import components_by_size
 from colmap_vg.graph.rigidity import largest_rigid_component
@@ -43,6 +44,7 @@ class Ledger:
         self._focal_scales = np.ones(num_cameras(graph))
         self._seen_cameras = np.zeros(num_cameras(graph), dtype=bool)
         self._converged = True
+        self._covariances: Array | None = None
 
     @property
     def usable(self) -> BoolArray:
@@ -99,9 +101,26 @@ class Ledger:
         kept[part.edge_rows] = True
         return self.largest_rigid_part(Subgraph.of(self.graph.edges, staying, kept), seed)
 
-    def place(self, part: Subgraph, rotations: Array, centers: Array, focal_scales: Array, converged: bool) -> None:
-        """Take down the poses of a part as a component of its own; centroid 0, root mean square distance 1."""
+    def place(
+        self,
+        part: Subgraph,
+        rotations: Array,
+        centers: Array,
+        focal_scales: Array,
+        converged: bool,
+        covariances: tuple[Array, Array] | None = None,
+    ) -> None:
+        """Take down the poses of a part as a component of its own; centroid 0, root mean square distance 1.
+
+        `covariances` are those of the centres and of the rotations, (k, 3, 3) each.
+        """
         moved = centers - centers.mean(axis=0)
+        if covariances is not None:
+            self._covariances = (
+                np.full((2, self.graph.num_images, 3, 3), np.nan) if self._covariances is None else self._covariances
+            )
+            self._covariances[0, part.images] = covariances[0] / np.mean(np.sum(moved**2, axis=1))
+            self._covariances[1, part.images] = covariances[1]
         self._R[part.images] = so3.project(rotations)
         self._p[part.images] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
         self._component[part.images] = self._component.max(initial=-1) + 1
@@ -145,8 +164,26 @@ class Ledger:
             status=status,
             message=message,
             caveats=tuple(self.caveats),
+            position_covariances=None if self._covariances is None else self._covariances[0],
+            rotation_covariances=None if self._covariances is None else self._covariances[1],
+            edge_residual_sigmas=self._edge_residual_sigmas(inside),
             log=tuple(self.log),
         )
+
+    def _edge_residual_sigmas(self, inside: BoolArray) -> Array | None:
+        graph = self.graph
+        if graph.edge_information is None:
+            return None
+        sigmas, rows = np.full(graph.num_edges, np.nan), np.flatnonzero(inside & graph.has_direction)
+        sigmas[rows] = edge_residual_sigmas(
+            graph.edges[rows],
+            graph.cam2_from_cam1_rotations[rows],
+            graph.cam2_in_cam1_directions[rows],
+            graph.edge_information[rows],
+            self._R,
+            self._p,
+        )
+        return sigmas
 
 
 def described(image_verdicts: NDArray[np.generic], converged: bool) -> tuple[SolutionStatus, str]:

@@ -14,6 +14,7 @@ from colmap_vg.colmap_io.read import read_with_caveats
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
 from colmap_vg.errors import MappingError
+from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.ledger import described
 from colmap_vg.mapping.build import (
     MAX_NUM_ROUNDS,
@@ -255,6 +256,7 @@ def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Mo
     status, message = described(words, solution.status != SolutionStatus.NOT_CONVERGED)
     return replace(
         solution,
+        position_covariances=_covariances_in_models(solution, centers, component),
         cam_from_world_rotations=rotations,
         projection_centers=centers,
         registered=component == 0,
@@ -264,6 +266,22 @@ def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Mo
         status=status,
         message=message,
     )
+
+
+def _covariances_in_models(
+    solution: PoseSolution, centers: NDArray[np.float64], component: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
+    """Covariances of positions, turned and scaled into the frames of the models; NaN for images that came later."""
+    if solution.position_covariances is None:
+        return None
+    covariances = np.full_like(solution.position_covariances, np.nan)
+    for model in range(int(component.max(initial=-1)) + 1):
+        rows = np.flatnonzero((component == model) & np.isfinite(solution.projection_centers).all(axis=1))
+        if len(rows) >= 3:
+            _, similarity = align_positions(solution.projection_centers[rows], centers[rows])
+            turned = similarity.rotation @ solution.position_covariances[rows] @ similarity.rotation.T
+            covariances[rows] = similarity.scale**2 * turned
+    return covariances
 
 
 def _focal_scales(

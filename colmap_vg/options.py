@@ -66,6 +66,7 @@ class SolveOptions(_Checked):
     accelerate: bool = True  # Anderson acceleration of the outer iterations of 1C, 1O, 2C, 2O; same fixed point
     max_num_iterations: int = _number(1000, 1)  # outer iterations of 1C, 1O, 2C, 2O
     convergence_tolerance: float = _number(1e-6, 0.0, 1.0)  # relative change of positions between outer iterations
+    covariances: bool = False  # of the cameras that the epipolar adjustment finds; a fifth of the solver's time more
     refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal was not given
     max_matches_per_edge: int = _number(500, 0)  # matches in the epipolar adjustment, spread over the image; 0: all
     random_seed: int = _number(0, 0)

@@ -49,6 +49,13 @@ class PoseSolution:
         Component each image belongs to, numbered by size; -1 where unsolved.
     focal_scales : (c,) array
         Factor on each camera's focal length in the graph.
+    position_covariances : (n, 3, 3) array or None
+        Of the centres, in their component's frame and unit after the best similarity; where asked for.
+    rotation_covariances : (n, 3, 3) array or None
+        Of small turns w of each camera in its own frame, ``R <- exp(w) R``, squared radians; where asked for.
+    edge_residual_sigmas : (m,) array or None
+        Root mean square of the whitened differences of each edge's relative pose from the solution's, about 1 under
+        the noise of its matches alone; NaN where the edge has no information or its images share no component.
     edge_kept : (m,) bool array
     edge_verdicts : (m,) str array
         `EdgeVerdict` words.
@@ -74,4 +81,7 @@ class PoseSolution:
     status: SolutionStatus
     message: str
     caveats: tuple[str, ...] = ()
+    position_covariances: Array | None = None
+    rotation_covariances: Array | None = None
+    edge_residual_sigmas: Array | None = None
     log: tuple[LogEntry, ...] = field(default=())

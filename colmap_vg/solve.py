@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.edge_residuals import edge_residual_sigmas
 from colmap_vg.edge_weights import edge_weights
-from colmap_vg.epipolar.adjustment import adjust_epipolar
+from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
+from colmap_vg.epipolar.covariance import camera_covariances
 from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
@@ -38,6 +40,7 @@ from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 MIN_COMPONENT_IMAGES = 3
 """Two images have no more than a direction between them."""
@@ -48,6 +51,9 @@ MAX_DEVIATION = 0.1
 MAX_SHARE_LEAVING, MAX_ROUNDS_OF_LEAVING = 0.1, 20
 """Images that leave at once, and how often: one that is far off takes its neighbours' certainty with it, so that of
 those that leave together none is three times as certain as another."""
+CONTRADICTION = 10.0
+"""Residuals of a pair over those of the median pair, in standard deviations, from which on it is false. What all pairs
+share, a lens not quite as modelled, is in the median; noise of one pair does not reach five."""
 TRIAL_SHARE = 0.25
 """Share of the rotation gate that pairs on trial must keep within: one false pair in 10^5 does, by chance."""
 
@@ -94,7 +100,11 @@ def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> P
         own = rotations[gated.rows_of(rigid.images)]
         poses = _Poses(own, np.zeros((rigid.num_images, 3)), np.ones(num_cameras(graph)))
         rigid, poses = _solve_part(ledger, rigid, poses, options)
-        ledger.place(rigid, poses.rotations, poses.centers, poses.focal_scales, poses.converged)
+        if rigid.num_images < MIN_COMPONENT_IMAGES:
+            ledger.leave_out(gated, ImageVerdict.NOT_RIGID)
+            unsolved[gated.images] = False
+            continue
+        ledger.place(rigid, poses.rotations, poses.centers, poses.focal_scales, poses.converged, poses.covariances)
         unsolved[rigid.images] = False
 
 
@@ -106,6 +116,7 @@ class _Poses:
     centers: Array
     focal_scales: Array
     converged: bool = True
+    covariances: tuple[Array, Array] | None = None
 
 
 def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) -> tuple[Array, Subgraph]:
@@ -280,17 +291,57 @@ def _adjust_epipolar(
     found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     ledger.log.extend(found.log)
     ledger.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
+    dropped = found.reversed_edges | _contradicting(ledger, part, found)
+    if dropped.sum() > found.reversed_edges.sum():
+        ledger.drop(part.edge_rows[dropped & ~found.reversed_edges], EdgeVerdict.CONTRADICTS_POSES)
+        rest = replace(problem.without(dropped), free_focals=problem.free_focals & ~found.lost_focals)
+        again = adjust_epipolar(
+            rest,
+            found.cam_from_world_rotations,
+            found.projection_centers,
+            directions[~dropped],
+            initial_focal_scales=found.focal_scales,
+            scales_px=(found.scale_px,),
+            final_sigmas=0.0,
+        )
+        ledger.log.extend(again.log)
+        ledger.drop(part.edge_rows[~dropped][again.reversed_edges], EdgeVerdict.REVERSED)
+        problem, lost = rest, found.lost_focals | again.lost_focals
+        found = replace(again, lost_focals=lost)
     group = focal_groups(ledger.graph)[0]
     if found.lost_focals.any():
         count = int(found.lost_focals[group].sum())
         ledger.caveats.append(
             f"The matches do not tell the focal length of {count} of {len(group)} cameras; it stays as it was read."
         )
-    focal_scales = found.focal_scales[group]
-    fixed = ledger.largest_rigid_part(part, options.random_seed) if found.reversed_edges.any() else part
+    fixed = ledger.largest_rigid_part(part, options.random_seed) if dropped.any() else part
     rows = part.rows_of(fixed.images)
-    rotations, centers = found.cam_from_world_rotations[rows], found.projection_centers[rows]
-    return fixed, _Poses(rotations, centers, focal_scales, found.converged)
+    solved = _Poses(
+        found.cam_from_world_rotations[rows],
+        found.projection_centers[rows],
+        found.focal_scales[group],
+        found.converged,
+    )
+    if options.covariances:
+        known = camera_covariances(problem, found, seed=options.random_seed)
+        solved = replace(solved, covariances=(known.positions[rows], known.rotations[rows]))
+    return fixed, solved
+
+
+def _contradicting(ledger: Ledger, part: Subgraph, found: AdjustmentResult) -> BoolArray:
+    """Edges (e,) of a part whose relative poses no noise takes that far from the adjusted cameras."""
+    graph, rows = ledger.graph, part.edge_rows
+    if graph.edge_information is None:
+        return np.zeros(len(rows), dtype=bool)
+    sigmas = edge_residual_sigmas(
+        part.edges,
+        graph.cam2_from_cam1_rotations[rows],
+        graph.cam2_in_cam1_directions[rows],
+        graph.edge_information[rows],
+        found.cam_from_world_rotations,
+        found.projection_centers,
+    )
+    return np.asarray((sigmas > CONTRADICTION * max(float(np.median(sigmas)), 1.0)) & ~ledger.trusted[rows])
 
 
 def _world_directions(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:

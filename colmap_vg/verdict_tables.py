@@ -24,25 +24,42 @@ from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.view_graph import ViewGraph
 
 IMAGES_NAME, PAIRS_NAME = "images.csv", "pairs.csv"
-_IMAGE_COLUMNS = ("image", "model", "verdict", "num_pairs", "num_kept_pairs")
-_PAIR_COLUMNS = ("image1", "image2", "verdict", "num_inliers", "rotation_error_deg", "direction_error_deg")
+_IMAGE_COLUMNS = (
+    "image",
+    "model",
+    "verdict",
+    "num_pairs",
+    "num_kept_pairs",
+    "position_sigma_percent",
+    "rotation_sigma_deg",
+)
+_PAIR_COLUMNS = ("image1", "image2", "verdict", "num_inliers", "rotation_error_deg", "direction_error_deg", "sigmas")
 MAX_PAIRS_SHOWN = 30
 
 
 @dataclass(frozen=True)
 class ImageRow:
-    """An image of a finished job; `model` is empty where it is in none."""
+    """An image of a finished job; `model` is empty where it is in none.
+
+    Deviations are those of the viewing graph's solution, before bundle adjustment, where they were asked for: of the
+    position in percent of the scene's radius (root mean square), of the rotation in degrees.
+    """
 
     image: str
     model: str
     verdict: str
     num_pairs: int
     num_kept_pairs: int
+    position_sigma_percent: str = ""
+    rotation_sigma_deg: str = ""
 
 
 @dataclass(frozen=True)
 class PairRow:
-    """A verified pair of a finished job; errors are empty where its images do not share a model."""
+    """A verified pair of a finished job; errors are empty where its images do not share a model.
+
+    `sigmas` is the error in standard deviations of the pair's own matches, against the viewing graph's solution.
+    """
 
     image1: str
     image2: str
@@ -50,6 +67,7 @@ class PairRow:
     num_inliers: str
     rotation_error_deg: str
     direction_error_deg: str
+    sigmas: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,22 +91,40 @@ def verdict_tables(graph: ViewGraph, solution: PoseSolution, skipped: Mapping[st
     names = image_names(graph)
     count = np.bincount(graph.edges.ravel(), minlength=graph.num_images)
     kept = np.bincount(graph.edges[solution.edge_kept].ravel(), minlength=graph.num_images)
+    position, turn = deviations(solution)
     images = [
-        ImageRow(name, str(component) if component >= 0 else "", str(verdict), int(pairs), int(kept_pairs))
-        for name, component, verdict, pairs, kept_pairs in zip(
-            names, solution.component.tolist(), solution.image_verdicts, count, kept, strict=True
+        ImageRow(name, str(model) if model >= 0 else "", str(verdict), int(own), int(held), _number(p), _number(t))
+        for name, model, verdict, own, held, p, t in zip(
+            names, solution.component.tolist(), solution.image_verdicts, count, kept, position, turn, strict=True
         )
     ]
     images += [ImageRow(name, "", reason, 0, 0) for name, reason in (skipped or {}).items()]
     rotation, direction = pose_errors_deg(graph, solution)
     inliers = [""] * graph.num_edges if graph.num_inliers is None else [str(k) for k in graph.num_inliers.tolist()]
+    sigmas = solution.edge_residual_sigmas
+    if sigmas is None:
+        sigmas = np.full(graph.num_edges, np.nan)
     pairs = [
-        PairRow(names[i], names[j], str(verdict), k, _number(r), _number(d))
-        for (i, j), verdict, k, r, d in zip(
-            graph.edges.tolist(), solution.edge_verdicts, inliers, rotation, direction, strict=True
+        PairRow(names[i], names[j], str(verdict), k, _number(r), _number(d), _number(s))
+        for (i, j), verdict, k, r, d, s in zip(
+            graph.edges.tolist(), solution.edge_verdicts, inliers, rotation, direction, sigmas, strict=True
         )
     ]
     return VerdictTables(tuple(images), tuple(pairs))
+
+
+def deviations(solution: PoseSolution) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Deviations (n,) of positions, percent of their model's radius, and rotations, degrees; NaN where unknown."""
+    if solution.position_covariances is None or solution.rotation_covariances is None:
+        unknown = np.full(len(solution.image_ids), np.nan)
+        return unknown, unknown
+    position = np.sqrt(np.trace(solution.position_covariances, axis1=1, axis2=2))
+    turn = np.sqrt(np.trace(solution.rotation_covariances, axis1=1, axis2=2))
+    for model in range(int(solution.component.max(initial=-1)) + 1):
+        rows = solution.component == model
+        p = solution.projection_centers[rows]
+        position[rows] /= np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1)))
+    return 100.0 * position, np.degrees(turn)
 
 
 def image_names(graph: ViewGraph) -> list[str]:
@@ -166,7 +202,15 @@ def read_tables(output_path: Path) -> VerdictTables:
         They are not there, or damaged.
     """
     images = [
-        ImageRow(r["image"], r["model"], r["verdict"], int(r["num_pairs"]), int(r["num_kept_pairs"]))
+        ImageRow(
+            r["image"],
+            r["model"],
+            r["verdict"],
+            int(r["num_pairs"]),
+            int(r["num_kept_pairs"]),
+            r["position_sigma_percent"],
+            r["rotation_sigma_deg"],
+        )
         for r in _rows(output_path / IMAGES_NAME, _IMAGE_COLUMNS)
     ]
     pairs = [PairRow(*(r[column] for column in _PAIR_COLUMNS)) for r in _rows(output_path / PAIRS_NAME, _PAIR_COLUMNS)]
@@ -212,6 +256,11 @@ def explain_image(tables: VerdictTables, name: str) -> list[str]:
     place = f"in model {row.model}" if row.model else "left out"
     lines = [f"{row.image}: {place}, {row.verdict} ({image_reason(row.verdict)})"]
     lines.append(f"  {row.num_kept_pairs} of its {row.num_pairs} pairs were kept")
+    if row.position_sigma_percent:
+        lines.append(
+            f"  before bundle adjustment known to {row.position_sigma_percent} % of the scene's radius"
+            f" and {row.rotation_sigma_deg}°"
+        )
     pairs = [pair for pair in tables.pairs if name in (pair.image1, pair.image2)]
     pairs.sort(key=lambda pair: -int(pair.num_inliers or 0))
     for pair in pairs[:MAX_PAIRS_SHOWN]:
@@ -268,6 +317,8 @@ def _described(pair: PairRow) -> str:
         parts.append(f"rotation {pair.rotation_error_deg}° off the model")
     if pair.direction_error_deg:
         parts.append(f"direction {pair.direction_error_deg}° off the model")
+    if pair.sigmas:
+        parts.append(f"{pair.sigmas} standard deviations")
     return ", ".join(parts)
 
 

@@ -37,6 +37,10 @@ class EdgeVerdict(Verdict):
     ROTATION_OUTLIER = "rotation_outlier", "its rotation contradicts the averaged rotations"
     DIRECTION_OUTLIER = "direction_outlier", "its direction contradicts the solved positions"
     ONE_DSFM = "one_dsfm", "1DSfM's broken weight is above the threshold"
+    CONTRADICTS_POSES = (
+        "contradicts_poses",
+        "its relative pose is ten times as far from the solved one as that of other pairs, in standard deviations",
+    )
     REVERSED = "reversed", "its direction points away from the solved one"
     OUTSIDE = "outside_component", "it lies outside what was solved, or links two models"
 

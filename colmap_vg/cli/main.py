@@ -85,6 +85,9 @@ ShareCameras = Annotated[
 ]
 NumThreads = Annotated[int, typer.Option(*colmap_flags.NUM_THREADS, help="-1: all cores.")]
 RandomSeed = Annotated[int, typer.Option(*colmap_flags.RANDOM_SEED, help="Same seed and threads, same result.")]
+CovariancesFlag = Annotated[
+    str, typer.Option("--covariances", metavar="0|1", help="How well each camera is known, before bundle adjustment.")
+]
 ExcludedPairs = Annotated[
     Path | None, typer.Option("--excluded_pairs_path", help="Text file, two image names a line: pairs not to be used.")
 ]
@@ -124,6 +127,7 @@ def run(
     outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
     rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
     edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
+    covariances: CovariancesFlag = "0",
     trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
     excluded_pairs_path: ExcludedPairs = None,
     trusted_pairs_path: TrustedPairs = None,
@@ -164,6 +168,7 @@ def run(
                 outlier_filter,
                 rotation_gate_deg,
                 edge_weights,
+                covariances,
                 ba_refine_focal_length,
                 random_seed,
             ),
@@ -192,6 +197,7 @@ def mapper(
     outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
     rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
     edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
+    covariances: CovariancesFlag = "0",
     trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
     excluded_pairs_path: ExcludedPairs = None,
     trusted_pairs_path: TrustedPairs = None,
@@ -230,6 +236,7 @@ def mapper(
                 outlier_filter,
                 rotation_gate_deg,
                 edge_weights,
+                covariances,
                 ba_refine_focal_length,
                 random_seed,
             ),
@@ -258,6 +265,7 @@ def solve(
     outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
     rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
     edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
+    covariances: CovariancesFlag = "0",
     trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
     excluded_pairs_path: ExcludedPairs = None,
     trusted_pairs_path: TrustedPairs = None,
@@ -281,6 +289,7 @@ def solve(
             outlier_filter,
             rotation_gate_deg,
             edge_weights,
+            covariances,
             ba_refine_focal_length,
             random_seed,
         )
@@ -399,6 +408,7 @@ def _solve_options(
     outlier_filter: str,
     rotation_gate_deg: float,
     edge_weights: str,
+    covariances: str,
     ba_refine_focal_length: str,
     random_seed: int,
 ) -> SolveOptions:
@@ -409,6 +419,7 @@ def _solve_options(
         outlier_filter=outlier_filter,  # type: ignore[arg-type]
         rotation_gate_deg=rotation_gate_deg,
         edge_weights=edge_weights,  # type: ignore[arg-type]
+        covariances=_boolean("--covariances", covariances),
         refine_focal_lengths="auto" if refine else "never",
         random_seed=_seed(random_seed),
     )

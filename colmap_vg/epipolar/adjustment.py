@@ -133,6 +133,7 @@ def adjust_epipolar(
     initial_centers: Array,
     directions: Array,
     *,
+    initial_focal_scales: Array | None = None,
     scales_px: tuple[float, ...] = (8.0, 2.0),
     final_sigmas: float = 1.0,
     max_num_iterations: int = 50,
@@ -149,6 +150,8 @@ def adjust_epipolar(
     directions : (m, 3) array
         Camera 2's centre in camera 1's frame by the edge's own matches: the cost does not tell it from its opposite, so
         after each scale edges that the cameras contradict by more than a right angle are dropped.
+    initial_focal_scales : (c,) array, optional
+        Factors on the problem's focal lengths to start from, default 1.
     scales_px : tuple of float
         Cauchy scales in turn, pixels.
     final_sigmas : float
@@ -172,7 +175,9 @@ def adjust_epipolar(
         raise GraphError("epipolar adjustment: the edges have no matches")
     lost = np.zeros(len(problem.focal_lengths), dtype=bool)
     while True:
-        start = Cameras(initial_rotations, gauged(initial_centers), np.zeros(len(lost)))
+        log_scales = np.zeros(len(lost)) if initial_focal_scales is None else np.log(initial_focal_scales)
+        log_scales[lost] = 0.0
+        start = Cameras(initial_rotations, gauged(initial_centers), log_scales)
         held = replace(problem, free_focals=problem.free_focals & ~lost)
         found = _in_stages(held, start, directions, scales_px, final_sigmas, max_num_iterations, tolerance)
         ran_away = np.abs(np.log(found.focal_scales)) > _MAX_LOG_FOCAL

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
-from colmap_vg.linear.solvers import SingularMatrixError, factorize
+from colmap_vg.linear.solvers import Factor, SingularMatrixError, factorize
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -80,21 +80,43 @@ class NormalSystem:
         self.num_images, self.free = num_images, free
         place = np.full(num_cameras, -1)
         place[free] = np.arange(len(free))
-        self._slots = [place[camera_idx[i]] for i in images]
+        self._images, self._slots = list(images), [place[camera_idx[i]] for i in images]
         self._pattern = BlockPattern(num_images, np.concatenate([_pairs(i) for i in images]), 6)
 
     def gradient(self, terms: Sequence[CameraTerms]) -> Array:
         """Sum of the terms' gradients: (6 n + f,)."""
-        poses, focals = np.zeros((self.num_images, 6)), np.zeros(len(self.free))
-        for term, slot in zip(terms, self._slots, strict=True):
-            poses += sum_at_nodes(self.num_images, term.images.ravel(), term.pose_gradients.reshape(-1, 6))
+        return self.summed([t.pose_gradients for t in terms], [t.focal_gradients for t in terms])
+
+    def summed(self, by_poses: Sequence[Array], by_focals: Sequence[Array]) -> Array:
+        """Sum of one or more columns by poses (q, 6 s, ...) and by log focals (q, s, ...) of terms: (6 n + f, ...)."""
+        columns = by_poses[0].shape[2:]
+        poses = np.zeros((self.num_images, 6, *columns))
+        focals = np.zeros((len(self.free), *columns))
+        for images, slot, by_pose, by_focal in zip(self._images, self._slots, by_poses, by_focals, strict=True):
+            poses += sum_at_nodes(self.num_images, images.ravel(), by_pose.reshape(-1, 6, *columns))
             used = slot >= 0
             if len(self.free):
-                focals += sum_at_nodes(len(self.free), slot[used], term.focal_gradients[used])
-        return np.concatenate([poses.ravel(), focals])
+                focals += sum_at_nodes(len(self.free), slot[used], by_focal[used])
+        return np.concatenate([poses.reshape(-1, *columns), focals])
+
+    def factor(self, terms: Sequence[CameraTerms]) -> Factor:
+        """The factored Hessian, without damping but what the gauge needs.
+
+        Raises
+        ------
+        SingularMatrixError
+            The terms do not fix all cameras.
+        """
+        return factorize(self._matrix(terms, 0.0))
 
     def step(self, terms: Sequence[CameraTerms], gradient: Array, damping: float) -> Array | None:
         """Levenberg's step (6 n + f,), each diagonal entry raised by its share; None where that does not suffice."""
+        try:
+            return -factorize(self._matrix(terms, damping)).solve(gradient)
+        except SingularMatrixError:
+            return None
+
+    def _matrix(self, terms: Sequence[CameraTerms], damping: float) -> sp.csc_array:
         n = self.num_images
         blocks = [np.concatenate(part) for part in zip(*(_split(t.pose_blocks) for t in terms), strict=True)]
         ii, jj, ij = blocks
@@ -104,12 +126,7 @@ class NormalSystem:
             diagonal += sum_at_nodes(n, t.images.ravel(), own)
         level = damping * diagonal + MIN_DAMPING * diagonal.max(axis=0)
         matrix = self._pattern.assemble(ii, jj, ij, level[:, :, None] * np.eye(6))
-        if len(self.free):
-            matrix = self._bordered(matrix, terms, damping)
-        try:
-            return -factorize(matrix).solve(gradient)
-        except SingularMatrixError:
-            return None
+        return self._bordered(matrix, terms, damping) if len(self.free) else matrix
 
     def _bordered(self, poses: sp.csc_array, terms: Sequence[CameraTerms], damping: float) -> sp.csc_array:
         n, f = self.num_images, len(self.free)

@@ -158,8 +158,10 @@ def serve() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the asking process, which ends this one
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what COLMAP prints must not come between the answers
-    (length,) = _LENGTH.unpack(sys.stdin.buffer.read(_LENGTH.size))
-    level, task, arguments = pickle.loads(sys.stdin.buffer.read(length))
+    request = _request(sys.stdin.buffer)
+    if request is None:
+        return  # the asking process was gone before it had asked
+    level, task, arguments = pickle.loads(request)
     threading.Thread(target=_end_with, args=(sys.stdin.buffer,), daemon=True).start()
     pycolmap.logging.minloglevel = level
     log = StageLog(lambda event: _pass_on(event, answers))
@@ -172,6 +174,16 @@ def serve() -> None:
     else:
         answer = {"value": pickle.dumps(value).hex(), "result": log.records[-1].message}
     _tell(answers, answer)
+
+
+def _request(pipe: IO[bytes]) -> bytes | None:
+    """The pickled request; None where the pipe ends before it does."""
+    header = pipe.read(_LENGTH.size)
+    if len(header) < _LENGTH.size:
+        return None
+    (length,) = _LENGTH.unpack(header)
+    request = pipe.read(length)
+    return request if len(request) == length else None
 
 
 def _end_with(pipe: IO[bytes]) -> None:

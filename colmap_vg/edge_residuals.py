@@ -1,0 +1,48 @@
+"""How far the relative poses of edges are from solved cameras, in their own standard deviations."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.geometry import so3
+from colmap_vg.geometry.directions import normalized, tangent_basis
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def edge_residual_sigmas(
+    edges: IntArray,
+    cam2_from_cam1_rotations: Array,
+    cam2_in_cam1_directions: Array,
+    information: Array,
+    cam_from_world_rotations: Array,
+    projection_centers: Array,
+) -> Array:
+    """Root mean square of the five residuals of each edge, whitened by its information.
+
+    Parameters
+    ----------
+    edges : (m, 2) int array
+    cam2_from_cam1_rotations : (m, 3, 3) array
+    cam2_in_cam1_directions : (m, 3) array
+        Unit vectors.
+    information : (m, 5, 5) array
+        As `ViewGraph.edge_information`.
+    cam_from_world_rotations : (n, 3, 3) array
+    projection_centers : (n, 3) array
+
+    Returns
+    -------
+    (m,) array
+        About 1 under the noise of the edge's own matches; more where the camera model is not exact.
+    """
+    i, j = edges.T
+    R, p = cam_from_world_rotations, projection_centers
+    turn = so3.log(R[j] @ np.swapaxes(R[i], 1, 2) @ np.swapaxes(cam2_from_cam1_rotations, 1, 2))
+    solved = normalized(np.einsum("kab,kb->ka", R[i], p[j] - p[i]))
+    across = np.einsum("kab,ka->kb", tangent_basis(cam2_in_cam1_directions), solved)
+    sine = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(sine, np.einsum("ka,ka->k", solved, cam2_in_cam1_directions))
+    tilt = across * (angle / np.maximum(sine, np.finfo(float).tiny))[:, None]
+    residual = np.concatenate([turn, tilt], axis=1)
+    return np.asarray(np.sqrt(np.einsum("ka,kab,kb->k", residual, information, residual) / 5.0))
