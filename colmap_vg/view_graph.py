@@ -99,6 +99,12 @@ class ViewGraph:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, _array(name, value, kind))
+            elif name in _REQUIRED:
+                raise GraphError(f"ViewGraph.{name} is missing")
+        for names in _TOGETHER:
+            absent = [name for name in names if getattr(self, name) is None]
+            if absent and len(absent) < len(names):
+                raise GraphError(f"ViewGraph.{absent[0]} is missing; {', '.join(names)} go together")
         self._check_shapes()
         self._check_values()
 
@@ -189,8 +195,32 @@ class ViewGraph:
             o, k = self.inlier_offsets, 0 if self.inlier_bearings1 is None else len(self.inlier_bearings1)
             if o[0] != 0 or o[-1] != k or (np.diff(o) < 0).any():
                 raise GraphError(f"ViewGraph.inlier_offsets must rise from 0 to the number of inliers {k}")
-        if self.camera_idx is not None and len(self.camera_idx) and self.camera_idx.min() < 0:
-            raise GraphError("ViewGraph.camera_idx holds negative rows")
+        if self.camera_idx is not None and len(self.camera_idx):
+            last = self.camera_idx.max() if self.camera_focal_lengths is None else len(self.camera_focal_lengths) - 1
+            if self.camera_idx.min() < 0 or self.camera_idx.max() > min(last, _MAX_ROW):
+                raise GraphError(f"ViewGraph.camera_idx holds rows that are no camera's: {self.camera_idx.max()}")
+        if self.num_inliers is not None:
+            _refuse("num_inliers", np.asarray(self.num_inliers < 0), "is negative")
+        if self.camera_focal_lengths is not None:
+            f = self.camera_focal_lengths
+            _refuse("camera_focal_lengths", np.asarray(~((f > 0) & (f < np.inf))), "is no focal length in pixels")
+        if self.edge_information is not None:
+            _refuse("edge_information", _no_information(self.edge_information), "is no information matrix")
+        for name in ("inlier_bearings1", "inlier_bearings2"):
+            rays = getattr(self, name)
+            if rays is not None:
+                squared = np.einsum("ka,ka->k", rays, rays)
+                _refuse(name, np.asarray(~(np.abs(squared - 1.0) < 2e-6)), "is no unit vector")
+
+
+_REQUIRED = ("image_ids", "edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions")
+_TOGETHER = (
+    ("inlier_offsets", "inlier_bearings1", "inlier_bearings2"),
+    ("inlier_keypoints1", "inlier_keypoints2"),
+    ("camera_ids", "camera_focal_lengths"),
+)
+_MAX_ROW = 2**31
+"""A larger row number is a mistake, not a camera: arrays of that length would be made for it."""
 
 
 _KINDS: dict[str, type] = {
@@ -217,12 +247,36 @@ _KINDS: dict[str, type] = {
 
 
 def _array(name: str, value: object, kind: type) -> NDArray[np.generic]:
-    found = np.asarray(value)
+    try:
+        found = np.asarray(value)
+    except ValueError as error:
+        raise GraphError(f"ViewGraph.{name} is no array: {error}") from error
+    if found.ndim == 0:
+        raise GraphError(f"ViewGraph.{name} must be an array, found {found}")
     if name in ("edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions") and found.size == 0:
         found = found.reshape(0, *{"edges": (2,), "cam2_from_cam1_rotations": (3, 3)}.get(name, (3,)))
-    if issubclass(kind, np.integer) and found.size and not np.issubdtype(found.dtype, np.integer):
-        raise GraphError(f"ViewGraph.{name} must hold integers, found {found.dtype}")
-    return np.asarray(found, dtype=None if kind is np.str_ else kind)
+    allowed, what = _ALLOWED[np.dtype(kind).kind]
+    if found.size and found.dtype.kind not in allowed:
+        raise GraphError(f"ViewGraph.{name} must hold {what}, found {found.dtype}")
+    if (
+        np.dtype(kind).kind == "i"
+        and found.size
+        and (found.max() > np.iinfo(kind).max or found.min() < np.iinfo(kind).min)
+    ):
+        raise GraphError(f"ViewGraph.{name} holds {found.max()}, too large a number")
+    return np.asarray(found, dtype=kind)
+
+
+_ALLOWED = {"i": ("iu", "integers"), "f": ("iuf", "real numbers"), "b": ("b", "True or False"), "U": ("UO", "words")}
+
+
+def _no_information(matrices: Array) -> BoolArray:
+    """Matrices (m, 5, 5) that are not finite, or have a negative variance, or are not symmetric."""
+    with np.errstate(invalid="ignore"):
+        size = np.abs(matrices).max(axis=(1, 2), initial=0.0)
+        skew = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max(axis=(1, 2), initial=0.0)
+        negative = (np.diagonal(matrices, axis1=1, axis2=2) < 0).any(axis=1)
+        return np.asarray(~np.isfinite(size) | negative | (skew > 1e-6 * size))
 
 
 def _refuse(name: str, bad: BoolArray, what: str) -> None:

@@ -283,6 +283,58 @@ DAMAGES: dict[str, tuple[list[str | tuple[str, tuple[object, ...]]], tuple[str, 
         ["UPDATE images SET name = CAST(x'ff2e706e67' AS TEXT) WHERE image_id = 2"],
         ("image 2", "UTF-8"),
     ),
+    "image id is negative": (
+        [
+            "PRAGMA foreign_keys = OFF",
+            "PRAGMA ignore_check_constraints = ON",
+            "UPDATE images SET image_id = -3 WHERE image_id = 3",
+        ],
+        ("image -3", "its id"),
+    ),
+    "camera id is too large": (
+        ["PRAGMA foreign_keys = OFF", "UPDATE cameras SET camera_id = 4294967296"],
+        ("camera 4294967296", "its id"),
+    ),
+    "pair id is text": (
+        [
+            "CREATE TABLE copied AS SELECT * FROM two_view_geometries",
+            f"UPDATE copied SET pair_id = 'one' WHERE pair_id = {pair_id(1, 4)}",
+            "DROP TABLE two_view_geometries",
+            "ALTER TABLE copied RENAME TO two_view_geometries",
+        ],
+        ("'one'",),
+    ),
+    "image twice": (
+        [
+            "CREATE TABLE copied AS SELECT * FROM images",
+            "INSERT INTO copied SELECT * FROM images WHERE image_id = 2",
+            "DROP TABLE images",
+            "ALTER TABLE copied RENAME TO images",
+        ],
+        ("image 2", "twice"),
+    ),
+    "name twice": (
+        [
+            "CREATE TABLE copied AS SELECT * FROM images",
+            "DROP TABLE images",
+            "ALTER TABLE copied RENAME TO images",
+            "UPDATE images SET name = 'same.jpg' WHERE image_id < 3",
+        ],
+        ("'same.jpg'", "several images"),
+    ),
+    "keypoints far outside": (
+        [("UPDATE keypoints SET data = CAST(? || substr(data, 5) AS BLOB) WHERE image_id = 3", (b"\xec\x78\xad\x60",))],
+        ("keypoints of image 3", "1e+20 pixels"),
+    ),
+    "camera of absurd size": (["UPDATE cameras SET width = 4611686018427387904"], ("camera 1", "its size")),
+    "one of two focal lengths is zero": (
+        [("UPDATE cameras SET model = 1, params = ?", (np.array([0.0, 1280.0, 512.0, 384.0]).tobytes(),))],
+        ("camera 1", "focal length"),
+    ),
+    "principal point is huge": (
+        [("UPDATE cameras SET params = ?", (np.array([1280.0, 1e300, 384.0]).tobytes(),))],
+        ("camera 1", "1e+300"),
+    ),
     "name is empty": (["UPDATE images SET name = '' WHERE image_id = 2"], ("image 2", "name")),
 }
 """Statements that damage a database of four images or more, and what the error must name."""

@@ -39,6 +39,11 @@ def test_read_verdicts_say_what_may_be_used(graph):
     assert graph.has_direction[:3].tolist() == [False, False, True]
 
 
+def _rays(count):
+    rays = np.tile([0.0, 0.0, 1.0], (count, 1))
+    return {"inlier_bearings1": rays, "inlier_bearings2": rays}
+
+
 def _bad(array, row, value):
     array = array.copy()
     array[row] = value
@@ -59,7 +64,21 @@ def _bad(array, row, value):
         (lambda g: {"cam2_in_cam1_directions": 2 * g.cam2_in_cam1_directions}, "unit"),
         (lambda g: {"num_inliers": np.ones(2, int)}, "num_inliers has shape"),
         (lambda g: {"image_names": ("a",)}, "1 names for 6 images"),
-        (lambda g: {"inlier_offsets": np.arange(g.num_edges + 1), "inlier_bearings1": np.ones((2, 3))}, "rise from 0"),
+        (lambda g: {"inlier_offsets": np.arange(g.num_edges + 1), **_rays(2)}, "rise from 0"),
+        (lambda g: {"inlier_offsets": np.zeros(g.num_edges + 1), "inlier_bearings1": np.ones((0, 3))}, "integers"),
+        (lambda g: {"inlier_bearings1": np.zeros((0, 3))}, "go together"),
+        (lambda g: {"inlier_offsets": np.full(g.num_edges + 1, 0), **_rays(0), "edges": None}, "edges is missing"),
+        (lambda g: {"cam2_in_cam1_directions": None}, "cam2_in_cam1_directions is missing"),
+        (lambda g: {"cam2_in_cam1_directions": g.cam2_in_cam1_directions.astype(str)}, "real numbers"),
+        (lambda g: {"cam2_in_cam1_directions": g.cam2_in_cam1_directions.astype(complex)}, "real numbers"),
+        (lambda g: {"image_ids": "text"}, "must be an array"),
+        (lambda g: {"image_ids": [[1], [2, 3]]}, "is no array"),
+        (lambda g: {"num_inliers": np.full(g.num_edges, -1)}, "negative"),
+        (lambda g: {"camera_idx": np.full(6, 2**62)}, "no camera"),
+        (lambda g: {"camera_idx": np.full(6, 1), "camera_ids": [1], "camera_focal_lengths": [9.0]}, "no camera"),
+        (lambda g: {"camera_ids": [1], "camera_focal_lengths": [0.0]}, "focal length"),
+        (lambda g: {"edge_information": np.full((g.num_edges, 5, 5), np.nan)}, "information"),
+        (lambda g: {"edge_information": np.tile(-np.eye(5), (g.num_edges, 1, 1))}, "information"),
     ],
 )
 def test_malformed_graphs_are_refused(graph, change, complaint):

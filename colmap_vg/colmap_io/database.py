@@ -6,8 +6,10 @@ user's file is only ever read by sqlite, and pycolmap gets a copy.
 
 import shutil
 import sqlite3
+import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +18,8 @@ from urllib.parse import quote
 from colmap_vg.errors import DatabaseError
 
 REQUIRED_TABLES = ("cameras", "images", "keypoints", "two_view_geometries")
+PATIENCE = 5.0
+"""Seconds to wait for another process that is writing to a database."""
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
@@ -26,24 +30,34 @@ def reading(database_path: str | PathLike[str]) -> Iterator[sqlite3.Connection]:
     Raises
     ------
     DatabaseError
-        The file is missing, empty, no database, damaged, or lacks COLMAP's tables.
+        The file is missing, empty, no database, damaged, lacks COLMAP's tables, or another process is writing it.
     """
     path = Path(database_path)
-    _check_file(path)
-    with TemporaryDirectory() as folder:
-        # What another process has written but not merged yet stands in the -wal file; only a copy of both shows it.
-        if _has_log(path):
-            path = _copied(path, Path(folder) / "database.db")
-            uri = f"file:{quote(str(path))}?mode=rw"
+    in_wal_mode = _check_file(path)
+    with ExitStack() as stack:
+        before = _state(path)
+        if before.sides:
+            # What a writer has not merged yet, or may have to take back, stands beside the file: only a copy of both
+            # shows the last finished transaction.
+            folder = stack.enter_context(_temporary_folder(path))
+            uri = f"file:{quote(str(_copied(path, folder / 'database.db')))}?mode=rw"
         else:
-            uri = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+            # In WAL mode every reader leaves files beside the database unless told that nothing changes; without a
+            # -wal file nobody has it open. Elsewhere readers leave nothing and mind the writers' locks.
+            uri = f"file:{quote(str(path.resolve()))}?mode=ro{'&immutable=1' if in_wal_mode else ''}"
         try:
-            with closing(sqlite3.connect(uri, uri=True)) as connection:
-                connection.text_factory = lambda raw: raw.decode("utf-8", errors="replace")
-                _check_tables(connection, Path(database_path))
-                yield connection
+            connection = stack.enter_context(closing(sqlite3.connect(uri, timeout=PATIENCE, uri=True)))
+            connection.text_factory = lambda raw: raw.decode("utf-8", errors="replace")
+            _check_tables(connection, path)
+            yield connection
         except sqlite3.Error as error:
+            if "locked" in str(error):
+                raise _written_by_another(path) from error
             raise DatabaseError(f"{database_path}: the database cannot be read ({error}); make it again") from error
+        except OverflowError as error:
+            raise DatabaseError(f"{database_path}: the database is damaged ({error}); make it again") from error
+        if not before.sides and _state(path) != before:
+            raise _written_by_another(path)
 
 
 def check_database(database_path: str | PathLike[str]) -> None:
@@ -78,33 +92,77 @@ def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:
     return _copied(Path(database_path), folder / "working_copy.db")
 
 
-def _has_log(path: Path) -> bool:
-    log = path.with_name(path.name + "-wal")
-    return log.exists() and log.stat().st_size > 0
+@dataclass(frozen=True)
+class _State:
+    """Of a database's file, and the files beside it that hold a part of what it says."""
+
+    file: tuple[int, int, int]
+    sides: tuple[str, ...]
+
+
+def _state(path: Path) -> _State:
+    try:
+        status = path.stat()
+        beside = [path.with_name(path.name + ending) for ending in ("-wal", "-journal")]
+        sides = tuple(side.name for side in beside if side.exists() and side.stat().st_size > 0)
+    except OSError as error:
+        raise DatabaseError(f"{path}: cannot be read ({error.strerror})") from error
+    return _State((status.st_ino, status.st_size, status.st_mtime_ns), sides)
+
+
+@contextmanager
+def _temporary_folder(path: Path) -> Iterator[Path]:
+    try:
+        folder = TemporaryDirectory()
+    except OSError as error:
+        raise DatabaseError(f"{path}: cannot be copied to the folder for temporary files ({error.strerror})") from error
+    with folder as name:
+        yield Path(name)
 
 
 def _copied(path: Path, target: Path) -> Path:
-    try:
-        shutil.copyfile(path, target)
-        if _has_log(path):
-            shutil.copyfile(path.with_name(path.name + "-wal"), target.with_name(target.name + "-wal"))
-    except OSError as error:
-        raise DatabaseError(f"{path}: cannot be copied to {target} ({error.strerror})") from error
-    return target
+    """Copy of a database that no writer touched meanwhile."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        before = _state(path)
+        try:
+            # A killed job's leftovers would be taken for changes of the new copy.
+            for leftover in target.parent.glob(target.name + "*"):
+                leftover.unlink()
+            shutil.copyfile(path, target)
+            for side in before.sides:
+                shutil.copyfile(path.with_name(side), target.with_name(target.name + side.removeprefix(path.name)))
+        except FileNotFoundError:
+            if time.monotonic() > deadline or not path.exists():
+                raise _written_by_another(path) from None
+            continue
+        except OSError as error:
+            raise DatabaseError(f"{path}: cannot be copied to {target} ({error.strerror})") from error
+        if _state(path) == before:
+            return target
+        if time.monotonic() > deadline:
+            raise _written_by_another(path)
+        time.sleep(0.05)
 
 
-def _check_file(path: Path) -> None:
+def _written_by_another(path: Path) -> DatabaseError:
+    return DatabaseError(f"{path}: another process is writing to the database; wait until it has ended")
+
+
+def _check_file(path: Path) -> bool:
+    """Whether the file, which must be one of sqlite's, is in WAL mode."""
     if path.is_dir():
         raise DatabaseError(f"{path}: is a folder, expected a COLMAP database file")
     try:
         with path.open("rb") as file:
-            head = file.read(len(_SQLITE_MAGIC))
+            head = file.read(20)
     except OSError as error:
         raise DatabaseError(f"{path}: cannot be read ({error.strerror}); give the path of a COLMAP database") from error
     if not head:
         raise DatabaseError(f"{path}: is empty; extract and match features first")
-    if head != _SQLITE_MAGIC:
+    if not head.startswith(_SQLITE_MAGIC):
         raise DatabaseError(f"{path}: is no SQLite file; give the path of a COLMAP database")
+    return head[18:20] != b"\x01\x01"  # the file format's read and write versions: 1 legacy, 2 WAL
 
 
 def _check_tables(connection: sqlite3.Connection, path: Path) -> None:

@@ -51,7 +51,7 @@ def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) 
     """The viewing graph, and what was changed or could not be decided on reading, one sentence each."""
     tables = read_tables(database_path)
     focals = decide_focal_lengths(tables, options)
-    return _graph(tables, focals, options), focals.caveats
+    return _graph(tables, focals, options), (*tables.caveats, *focals.caveats)
 
 
 def _graph(tables: DatabaseTables, focals: FocalDecision, options: ReadOptions) -> ViewGraph:

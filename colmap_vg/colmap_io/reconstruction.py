@@ -11,6 +11,7 @@ import pycolmap
 
 from colmap_vg.colmap_io.cameras import with_focal_scale
 from colmap_vg.colmap_io.database import working_copy
+from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.shared_cameras import merge_cameras
 from colmap_vg.errors import DatabaseError, OutputError
 from colmap_vg.solution import PoseSolution
@@ -61,7 +62,8 @@ def loaded_cache(
             with pycolmap.Database.open(copy) as database:
                 options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches, load_all_images=True)
                 cache = pycolmap.DatabaseCache.create(database, options)
-        except (ValueError, RuntimeError, IndexError, sqlite3.Error) as error:
+        except (ValueError, RuntimeError, IndexError, MemoryError, sqlite3.Error) as error:
+            # Out of memory, too: a damaged row may ask for any amount of it.
             raise DatabaseError(f"{database_path}: pycolmap cannot read the database ({error})") from error
         yield cache, replaced
     finally:
@@ -94,8 +96,7 @@ def reconstruction_from_solution(
     pycolmap.Reconstruction
         All images of the database; those of the component have poses.
     """
-    reconstruction = pycolmap.Reconstruction()
-    reconstruction.load(cache)
+    reconstruction = loaded_reconstruction(cache)
     if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
         for camera_id, focal, scale in zip(
             graph.camera_ids.tolist(), graph.camera_focal_lengths, solution.focal_scales, strict=True

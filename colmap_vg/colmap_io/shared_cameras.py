@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.view_graph import ViewGraph
 
 
@@ -80,8 +81,7 @@ def with_own_cameras(
     -------
     pycolmap.Reconstruction
     """
-    own = pycolmap.Reconstruction()
-    own.load(cache)
+    own = loaded_reconstruction(cache)
     for camera_id, camera in own.cameras.items():
         shared = replaced.get(camera_id, camera_id)
         if model.exists_camera(shared):

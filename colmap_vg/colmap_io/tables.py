@@ -1,6 +1,7 @@
 """The rows of a COLMAP database as arrays, read straight by sqlite; every damaged row is named."""
 
 import sqlite3
+from collections import Counter
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -10,10 +11,19 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.database import reading
+from colmap_vg.colmap_io.memory import BYTES_PER_MATCH_IN_COLMAP, affordable_matches_per_pair, available_memory
 from colmap_vg.errors import DatabaseError
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+MAX_SIZE_PX, MAX_COORDINATE_PX = 2**24, 1e7
+"""Pixels; larger images and coordinates are damage, and their products would leave the numbers' range."""
+MIN_FOCAL_SHARE, MAX_FOCAL_SHARE = 1e-3, 1e6
+"""Focal length over image size, from the widest lens to the longest telescope and far beyond."""
+MAX_PARAMETER = 1e9
+MAX_ID = 2**32 - 2
+"""COLMAP's ids are 32 bits wide, and the last one says "none"."""
 
 MAX_NUM_IMAGES = 2_147_483_647
 """COLMAP's pair id is ``image_id1 * MAX_NUM_IMAGES + image_id2`` with ``image_id1 < image_id2``."""
@@ -43,6 +53,8 @@ class DatabaseTables:
         Inlier matches of pair k are rows ``offsets[k]:offsets[k + 1]`` of `matches`.
     matches : (k, 2) int64 array
         Keypoint indices in image 1 and image 2.
+    caveats : tuple of str
+        What was left out to fit into memory.
     """
 
     cameras: tuple["pycolmap.Camera", ...]
@@ -59,6 +71,7 @@ class DatabaseTables:
     translations: Array
     offsets: IntArray
     matches: IntArray
+    caveats: tuple[str, ...] = ()
 
     def matched_points(self, rows: IntArray, pairs: IntArray, offsets: IntArray, side: int) -> Array:
         """Pixels (k, 2) of chosen rows of `matches` in image 1 (side 0) or 2 (side 1).
@@ -93,11 +106,12 @@ class _Reader:
 
     def cameras(self) -> list["pycolmap.Camera"]:
         query = "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY camera_id"
-        found = []
+        found: list[pycolmap.Camera] = []
         for camera_id, model, width, height, blob, prior in self._connection.execute(query):
             where = f"camera {camera_id}"
+            self._check_id(camera_id, [c.camera_id for c in found[-1:]], where, MAX_ID)
             params = self._values(blob, np.float64, where)
-            if not isinstance(width, int) or not isinstance(height, int) or width <= 0 or height <= 0:
+            if not all(isinstance(side, int) and 0 < side <= MAX_SIZE_PX for side in (width, height)):
                 raise self._damaged(where, f"its size is {width} x {height}")
             try:
                 camera = pycolmap.Camera(
@@ -108,11 +122,12 @@ class _Reader:
                 raise self._damaged(where, f"camera model {model} is unknown") from error
             if not fitting:
                 raise self._damaged(where, f"its {len(params)} parameters do not fit the model {camera.model_name}")
-            if not np.isfinite(params).all():
+            if not (np.abs(params) < MAX_PARAMETER).all():
                 raise self._damaged(where, f"its parameters are {camera.params_to_string()}")
             if camera.is_spherical():
                 raise DatabaseError(f"{self._path}: {where} is spherical; cut the panoramas into perspective images")
-            if camera.mean_focal_length() <= 0:
+            focals = params[list(camera.focal_length_idxs())] / max(width, height)
+            if not ((focals > MIN_FOCAL_SHARE) & (focals < MAX_FOCAL_SHARE)).all():
                 raise self._damaged(where, f"its focal length is {camera.mean_focal_length():g}")
             camera.has_prior_focal_length = bool(prior)
             found.append(camera)
@@ -120,19 +135,29 @@ class _Reader:
 
     def images(self, camera_rows: dict[int, int]) -> tuple[IntArray, tuple[str, ...], IntArray]:
         query = "SELECT image_id, CAST(name AS BLOB), camera_id FROM images ORDER BY image_id"
-        ids, names, cameras = [], [], []
+        ids: list[int] = []
+        names: list[str] = []
+        cameras: list[int] = []
         for image_id, name, camera_id in self._connection.execute(query):
             where = f"image {image_id}"
+            self._check_id(image_id, ids[-1:], where, MAX_NUM_IMAGES - 1)
+            if name is not None and not isinstance(name, bytes):
+                raise self._damaged(where, f"its name is {name!r}")
             try:
                 names.append((name or b"").decode("utf-8"))
             except UnicodeDecodeError as error:
                 raise self._damaged(where, f"its name {name!r} is not UTF-8; rename the file") from error
             if not names[-1]:
                 raise self._damaged(where, "it has no name")
+            if "\0" in names[-1]:
+                raise self._damaged(where, f"its name is {names[-1]!r}")
             if camera_id not in camera_rows:
                 raise self._damaged(f"{where} ({names[-1]})", f"it has camera {camera_id}, which does not exist")
             ids.append(image_id)
             cameras.append(camera_rows[camera_id])
+        again = [name for name, count in Counter(names).items() if count > 1]
+        if again:
+            raise self._damaged(f"name {again[0]!r}", "several images have it")
         return np.array(ids, dtype=np.int64), tuple(names), np.array(cameras, dtype=np.int64)
 
     def keypoints(self, image_ids: IntArray) -> tuple[NDArray[np.float32], ...]:
@@ -144,6 +169,8 @@ class _Reader:
                 raise self._damaged(where, "they have a single coordinate")
             if not np.isfinite(points).all():
                 raise self._damaged(where, "they hold NaN or infinite values")
+            if np.abs(points).max(initial=0.0) > MAX_COORDINATE_PX:
+                raise self._damaged(where, f"they hold coordinates of up to {np.abs(points).max():g} pixels")
             if image_id in found and len(points):
                 found[image_id] = points
         return tuple(found[int(i)] for i in image_ids)
@@ -158,22 +185,29 @@ class _Reader:
     ) -> DatabaseTables:
         columns = {row[1] for row in self._connection.execute("PRAGMA table_info(two_view_geometries)")}
         matrices = [c if c in columns else f"NULL AS {c}" for c in ("F", "E", "H", "qvec", "tvec")]
-        rows = self._connection.execute(
+        cap, caveats = self._cap()
+        rows, found = [], []
+        query = (
             f"SELECT pair_id, rows, cols, data, config, {', '.join(matrices)} FROM two_view_geometries"
             " WHERE rows > 0 ORDER BY pair_id"
-        ).fetchall()
-        found = []
-        for pair_id, num, cols, blob, config, *_ in rows:
+        )
+        for pair_id, num, cols, blob, *others in self._connection.execute(query):
+            if not isinstance(pair_id, int):
+                raise self._damaged("matches", f"their pair has the id {pair_id!r}")
             where = f"matches of {self._pair_name(pair_id)}"
-            found.append(self._values(blob, np.uint32, where, num, cols))
-            if cols != 2 or not isinstance(config, int):
-                raise self._damaged(where, f"they have {cols} columns and configuration {config!r}")
+            values = self._values(blob, np.uint32, where, num, cols)
+            if cols != 2 or not isinstance(others[0], int):
+                raise self._damaged(where, f"they have {cols} columns and configuration {others[0]!r}")
+            if 0 < cap < len(values):
+                values = values[np.linspace(0, len(values) - 1, cap).astype(np.int64)]
+            found.append(values)
+            rows.append((pair_id, *others))
         offsets = np.concatenate([[0], np.cumsum([len(values) for values in found])]).astype(np.int64)
         matches = np.concatenate([np.zeros((0, 2), dtype=np.uint32), *found]).astype(np.int64)
         pair_ids = np.array([r[0] for r in rows], dtype=np.int64)
         pairs = self._image_rows(pair_ids, image_ids)
         self._check_matches(pairs, pair_ids, offsets, matches, keypoints)
-        quaternions = self._stacked("qvec", [r[8] for r in rows], 4, pair_ids)
+        quaternions = self._stacked("qvec", [r[5] for r in rows], 4, pair_ids)
         return DatabaseTables(
             cameras,
             image_ids,
@@ -181,15 +215,33 @@ class _Reader:
             camera_idx,
             keypoints,
             pairs,
-            np.array([r[4] for r in rows], dtype=np.int64),
-            self._stacked("F", [r[5] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
-            self._stacked("E", [r[6] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
-            self._stacked("H", [r[7] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            np.array([r[1] for r in rows], dtype=np.int64),
+            self._stacked("F", [r[2] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            self._stacked("E", [r[3] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
+            self._stacked("H", [r[4] for r in rows], 9, pair_ids).reshape(-1, 3, 3),
             _rotations_from_wxyz(quaternions),
-            self._stacked("tvec", [r[9] for r in rows], 3, pair_ids),
+            self._stacked("tvec", [r[6] for r in rows], 3, pair_ids),
             offsets,
             matches,
+            caveats,
         )
+
+    def _cap(self) -> tuple[int, tuple[str, ...]]:
+        """Matches that each pair may keep to fit into memory, 0: all; and what to say of it."""
+        query = "SELECT length(data) FROM two_view_geometries WHERE rows > 0 AND typeof(data) = 'blob'"
+        numbers = np.array([size // 8 for (size,) in self._connection.execute(query)], dtype=np.int64)
+        memory = available_memory()
+        cap = affordable_matches_per_pair(numbers, memory)
+        free, total = f"{memory / 2**30:.1f} GiB of memory are free", f"{numbers.sum():,} matches"
+        if cap is None:
+            needed = numbers.sum() * BYTES_PER_MATCH_IN_COLMAP / 2**30
+            raise DatabaseError(
+                f"{self._path}: {total} of {len(numbers):,} pairs take {needed:.1f} GiB or more, and {free}: map parts"
+                " of the images, match fewer pairs, or use a machine with more memory"
+            )
+        if cap == 0:
+            return 0, ()
+        return cap, (f"{total} do not fit into memory ({free}): {cap} of each pair are used to solve, spread evenly.",)
 
     def _image_rows(self, pair_ids: IntArray, image_ids: IntArray) -> IntArray:
         pairs = np.stack([pair_ids // MAX_NUM_IMAGES, pair_ids % MAX_NUM_IMAGES], axis=1)
@@ -231,9 +283,16 @@ class _Reader:
             values = self._values(blob, np.float64, where)
             if len(values) not in (0, size):
                 raise self._damaged(where, f"it holds {len(values)} values, expected {size}")
-            if len(values):
+            # COLMAP's matrices and poses are of ordinary size; others are as good as none, and would overflow.
+            if len(values) and 1e-50 < np.nan_to_num(np.abs(values).max(), nan=np.inf) < 1e50:
                 out[k] = values
         return out
+
+    def _check_id(self, value: object, before: list[int], where: str, highest: int) -> None:
+        if not isinstance(value, int) or not 0 <= value <= highest:
+            raise self._damaged(where, f"its id is not between 0 and {highest}")
+        if value in before:
+            raise self._damaged(where, "it stands there twice")
 
     def _values(self, blob: object, kind: type, where: str, rows: object = None, cols: object = None) -> NDArray[Any]:
         """Values of a blob, which may be missing; as rows and columns where the database tells these."""

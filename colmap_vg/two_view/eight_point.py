@@ -41,8 +41,10 @@ def matrix_of_least_moment(moments: Array, *, rank_two: bool = False) -> Array:
         for _ in range(_NUM_RANK_STEPS):
             c = cofactors(e.reshape(-1, 3, 3)).reshape(-1, 9)
             cheapest = np.einsum("mab,mb->ma", inverse, c)
-            slope = np.einsum("ma,ma->m", c, cheapest)
-            e = e - (np.linalg.det(e.reshape(-1, 3, 3)) / np.maximum(slope, 1e-300))[:, None] * cheapest
+            slope, det = np.einsum("ma,ma->m", c, cheapest), np.linalg.det(e.reshape(-1, 3, 3))
+            # Longer than e itself: matches that are all one match say nothing of the determinant.
+            sane = slope > np.abs(det) * np.linalg.norm(cheapest, axis=1)
+            e = e - np.where(sane, det / np.where(sane, slope, 1.0), 0.0)[:, None] * cheapest
     # (W2 x2)^T E' (W1 x1) = x2^T (W2 E' W1) x1, W symmetric.
     E = whiten2 @ e.reshape(-1, 3, 3) @ whiten1
     return np.asarray(E / np.linalg.norm(E, axis=(1, 2), keepdims=True))
