@@ -1,5 +1,6 @@
 """Random viewing graphs, sound and broken: a seed gives the arguments of a `ViewGraph` and of `SolveOptions`."""
 
+from contextlib import suppress
 from typing import Any, get_args
 
 import numpy as np
@@ -29,7 +30,8 @@ def odd_case(seed: int) -> tuple[Fields, Fields, list[str]]:
     for _ in range(int(rng.choice([0, 0, 1, 1, 2]))):
         fault = FAULTS[int(rng.integers(len(FAULTS)))]
         odd.append(fault.__name__)
-        fault(fields, rng)
+        with suppress(AttributeError, TypeError, ValueError, IndexError):  # another fault took the array away
+            fault(fields, rng)
     options = {
         "method": str(rng.choice(get_args(Method))),
         "rotation_averaging": str(rng.choice(["robust", "chordal"])),
