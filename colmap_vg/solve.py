@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_vg.edge_residuals import edge_residual_sigmas
 from colmap_vg.edge_weights import edge_weights
 from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
+from colmap_vg.epipolar.baseline_lengths import connects_all, length_links, positions_by_lengths, solve_lengths
 from colmap_vg.epipolar.covariance import camera_covariances
 from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
@@ -31,6 +32,7 @@ from colmap_vg.positions.lud import solve_lud
 from colmap_vg.positions.orthogonal import solve_orthogonal
 from colmap_vg.positions.robust_directions import position_deviations, solve_robust_directions
 from colmap_vg.positions.shapefit import solve_shapefit
+from colmap_vg.robust import geman_mcclure_weight
 from colmap_vg.rotations.certificate import certify_chordal
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.rotations.robust import average_rotations_robust, rotation_residuals
@@ -54,6 +56,9 @@ those that leave together none is three times as certain as another."""
 CONTRADICTION = 10.0
 """Residuals of a pair over those of the median pair, in standard deviations, from which on it is false. What all pairs
 share, a lens not quite as modelled, is in the median; noise of one pair does not reach five."""
+TRUST_PER_MEDIAN, TRUST_SCALES_DEG = 5.0, (0.5, 10.0)
+"""Geman-McClure scale of what a rotation's residual says of the direction, over the median residual, and its range. A
+false pair across a long street would otherwise fold it: it costs more displacement than tearing a street apart."""
 TRIAL_SHARE = 0.25
 """Share of the rotation gate that pairs on trial must keep within: one false pair in 10^5 does, by chance."""
 
@@ -175,17 +180,25 @@ def _filter_directions(ledger: Ledger, part: Subgraph, rotations: Array, options
     rigid = ledger.largest_rigid_part(part, options.random_seed)
     if rigid.num_images < 3 or options.outlier_filter == "none":
         return rigid
-    directions = _world_directions(ledger.graph, rigid, rotations[part.rows_of(rigid.images)])
+    own = rotations[part.rows_of(rigid.images)]
+    directions = _world_directions(ledger.graph, rigid, own)
     if options.outlier_filter == "1dsfm":
         broken = one_dsfm_broken_weights(
             rigid.num_images, rigid.edges, directions, options.one_dsfm_num_directions, options.random_seed
         )
         ledger.drop(rigid.edge_rows[broken > options.one_dsfm_threshold], EdgeVerdict.ONE_DSFM)
     elif options.direction_gate_deg > 0:
-        weights = edge_weights(ledger.graph, rigid.edge_rows, options)
+        weights = edge_weights(ledger.graph, rigid.edge_rows, options) * _rotation_trust(ledger.graph, rigid, own)
         _, angles = robust_direction_residuals(rigid.num_images, rigid.edges, directions, weights)
         ledger.drop(rigid.edge_rows[angles > np.radians(options.direction_gate_deg)], EdgeVerdict.DIRECTION_OUTLIER)
     return ledger.largest_rigid_part(rigid, options.random_seed)
+
+
+def _rotation_trust(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:
+    """Weights (e,) of directions by how well their edges' rotations agree: a pair that is wrong is so in both."""
+    residuals = rotation_residuals(part.edges, graph.cam2_from_cam1_rotations[part.edge_rows], rotations)
+    scale = np.clip(TRUST_PER_MEDIAN * np.median(residuals), *np.radians(TRUST_SCALES_DEG))
+    return geman_mcclure_weight((residuals / scale) ** 2)
 
 
 def _solve_part(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOptions) -> tuple[Subgraph, _Poses]:
@@ -195,9 +208,24 @@ def _solve_part(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOpt
     problem = epipolar_problem(ledger.graph, part, options)
     if problem is None:
         return _solve_directions(ledger, part, poses, options)
-    # The adjustment goes on from wherever Alg. 2 is: its last digits would be lost work.
-    rough = replace(options, method="2O", max_num_iterations=ROUGH_ITERATIONS, convergence_tolerance=1e-3)
-    return _adjust_epipolar(ledger, part, problem, _solve_poses(ledger, part, poses, rough), options)
+    return _adjust_epipolar(ledger, part, problem, _rough_poses(ledger, part, problem, poses, options), options)
+
+
+def _rough_poses(
+    ledger: Ledger, part: Subgraph, problem: EpipolarProblem, poses: _Poses, options: SolveOptions
+) -> _Poses:
+    """Positions by the lengths that shared tracks give to baselines; by Alg. 2O where these do not reach all images."""
+    graph, rows, n = ledger.graph, part.edge_rows, part.num_images
+    links = length_links(problem, graph.cam2_from_cam1_rotations[rows], graph.cam2_in_cam1_directions[rows])
+    lengths = solve_lengths(len(rows), links)
+    start = None
+    if not connects_all(n, part.edges, np.isfinite(lengths)):
+        # The adjustment goes on from wherever Alg. 2 is: its last digits would be lost work.
+        rough = replace(options, method="2O", max_num_iterations=ROUGH_ITERATIONS, convergence_tolerance=1e-3)
+        poses = _solve_poses(ledger, part, poses, rough)
+        start = poses.centers
+    directions = _world_directions(graph, part, poses.rotations)
+    return replace(poses, centers=positions_by_lengths(n, part.edges, directions, lengths, start))
 
 
 def _solve_directions(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOptions) -> tuple[Subgraph, _Poses]:

@@ -14,10 +14,13 @@ from colmap_vg import (
     SolveOptions,
     ViewGraph,
     align_positions,
+    read_view_graph,
     solve_view_graph,
 )
+from colmap_vg.colmap_io.synthetic_database import write_synthetic_database
 from colmap_vg.geometry import so3
 from colmap_vg.synthetic import ring_scene
+from colmap_vg.synthetic_views import synthetic_views
 
 PAPER = {"rotation_averaging": "chordal", "rotation_gate_deg": 0.0, "outlier_filter": "none"}
 METHODS = ["1C", "1O", "2C", "2O"]
@@ -218,3 +221,12 @@ def test_a_certificate_needs_chordal_rotations():
     scene = ring_scene(25, 6, seed=3)
     solution = solve_view_graph(scene.graph, SolveOptions(method="1C", certify_rotations=True))
     assert "not certified" in solution.caveats[0]
+
+
+def test_false_pairs_across_a_long_street_neither_fold_it_nor_take_its_images(tmp_path):
+    views = synthetic_views("street", 200, num_keypoints=300)
+    write_synthetic_database(tmp_path / "database.db", views)
+    solution = solve_view_graph(read_view_graph(tmp_path / "database.db"))
+    assert solution.registered.all()
+    errors, _ = align_positions(solution.projection_centers, views.projection_centers)
+    assert errors.max() < 0.2  # metres, of two hundred

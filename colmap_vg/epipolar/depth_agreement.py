@@ -76,6 +76,16 @@ def depth_residuals(rays: TripletRays, poses: TripletPoses) -> Array:
     return np.concatenate([np.zeros(0), *parts])
 
 
+def inverse_depths(rays: TripletRays, poses: TripletPoses) -> Array:
+    """Inverse depths of all tracks in b, by a and by c: (2, k)."""
+    pieces = rays.pieces
+    parts = [
+        pieces.rows(np.stack([side.rho for side in _evaluate(rays, poses, block).sides]), block)
+        for block in pieces.blocks()
+    ]
+    return np.concatenate([np.zeros((2, 0)), *parts], axis=1)
+
+
 def depth_costs(rays: TripletRays, poses: TripletPoses, scale: float) -> Array:
     """``sum s^2 log(1 + r^2 / s^2)`` of each triplet, with the scale s in pixels: (q,)."""
     costs = np.zeros(rays.pieces.num_segments)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_of_rows, segment_subset, segment_sums
@@ -21,7 +22,7 @@ BoolArray = NDArray[np.bool_]
 
 HALF_EDGES_PER_IMAGE = 24
 """Half-edges of an image that are paired, those of most worth: pairs grow with the square of their number."""
-TRIPLETS_PER_IMAGE = 12
+TRIPLETS_PER_IMAGE = 6
 TRACKS_PER_TRIPLET = 60
 MIN_TRACKS = 10
 """Fewer shared keypoints make no triplet."""
@@ -105,7 +106,7 @@ def find_triplets(
     half_offsets = np.concatenate([offsets, offsets[1:] + k])
     keypoints = np.concatenate([keypoints1, keypoints2]).astype(np.int64)
     chosen = _best_of_each(middle, segment_sums(half_offsets, np.tile(np.square(sine), 2)), HALF_EDGES_PER_IMAGE)
-    pairs = _worthy_pairs(middle[chosen], other[chosen], half_offsets, keypoints, np.tile(sine, 2), chosen)
+    pairs = _worthy_pairs(middle[chosen], other[chosen], half_offsets, keypoints, np.tile(sine, 2), chosen, m)
     first, second = _join(pairs, half_offsets, keypoints)
     shared = np.concatenate([[0], np.cumsum(np.bincount(first[0], minlength=len(pairs)))]).astype(np.int64)
     kept = evenly_thinned(shared, TRACKS_PER_TRIPLET)
@@ -128,6 +129,7 @@ def _worthy_pairs(
     keypoints: IntArray,
     sine: Array,
     chosen: IntArray,
+    num_edges: int,
 ) -> IntArray:
     """Pairs (q, 2) of half-edges that share keypoints of an image, the worthiest of each image, in rising order."""
     rows, offsets = rows_of_segments(half_offsets, chosen)
@@ -144,8 +146,21 @@ def _worthy_pairs(
     if len(a) == 0:
         return np.zeros((0, 2), dtype=np.int64)
     worth = sp.csr_array(seen @ seen.T)
-    best = _best_of_each(middle[a], np.asarray(worth[a, c]).ravel(), TRIPLETS_PER_IMAGE)
+    value = np.asarray(worth[a, c]).ravel()
+    edge_a, edge_c = chosen[a] % num_edges, chosen[c] % num_edges
+    tree = _maximum_spanning_forest(edge_a, edge_c, value, num_edges)
+    best = np.union1d(_best_of_each(middle[a], value, TRIPLETS_PER_IMAGE), tree)
     return np.stack([chosen[a[best]], chosen[c[best]]], axis=1)
+
+
+def _maximum_spanning_forest(first: IntArray, second: IntArray, worth: Array, num_nodes: int) -> IntArray:
+    """Links (in rising order) that join all that can be joined, of most worth."""
+    order = np.argsort(worth, kind="stable")
+    links = sp.csr_array(
+        (1.0 + np.arange(len(order))[::-1], (first[order], second[order])), shape=(num_nodes, num_nodes)
+    )
+    tree = sp.coo_array(minimum_spanning_tree(links))
+    return np.sort(order[len(order) - tree.data.astype(np.int64)])
 
 
 def _join(pairs: IntArray, half_offsets: IntArray, keypoints: IntArray) -> tuple[tuple[IntArray, IntArray], IntArray]:

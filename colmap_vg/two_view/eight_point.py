@@ -186,9 +186,10 @@ def _sampson_weights(E: Array, pieces: Pieces, min_scale: float, on_sphere: bool
             spread += np.square(line1[:, 2]) + np.square(line2[:, 2]) - 2.0 * algebraic
         squared[block.pieces], variance[block.pieces] = algebraic, spread
     # A match beside both epipoles fits whatever its error: without a floor its weight would grow beyond all others.
+    # Where all keypoints are one, only the last term keeps the moments finite.
     offsets = pieces.offsets
     typical = segment_sums(offsets, pieces.rows(variance)) / np.maximum(np.diff(offsets), 1)
-    variance = np.maximum(variance, 1e-2 * typical[pieces.segments, None] + 1e-300)
+    variance = np.maximum(variance, 1e-2 * typical[pieces.segments, None] + 1e-60)
     squared /= variance
     scale = np.maximum(2.0 * np.sqrt(segment_quantiles(offsets, pieces.rows(squared))), min_scale)
     return np.asarray(cauchy_weight(squared / np.square(scale[pieces.segments, None])) / variance)

@@ -203,8 +203,10 @@ def odd_pair(connection: Connection, rng: Generator) -> None:
 
 def match_repeated(connection: Connection, rng: Generator) -> None:
     row = _row(connection, "two_view_geometries", rng)
-    (content,) = connection.execute("SELECT data FROM two_view_geometries WHERE rowid = ?", (row,)).fetchone()
-    values = np.frombuffer(content, dtype=np.uint32).reshape(-1, 2).copy()
+    found = connection.execute("SELECT data FROM two_view_geometries WHERE rowid = ?", (row,)).fetchone()
+    if found is None or not isinstance(found[0], bytes) or len(found[0]) == 0 or len(found[0]) % 8:
+        return  # damaged before
+    values = np.frombuffer(found[0], dtype=np.uint32).reshape(-1, 2).copy()
     side = int(rng.integers(3))
     values[:, slice(None) if side == 2 else side] = values[0, slice(None) if side == 2 else side]
     connection.execute("UPDATE two_view_geometries SET data = ? WHERE rowid = ?", (values.tobytes(), row))

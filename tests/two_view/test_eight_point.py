@@ -69,3 +69,9 @@ def test_fundamental_matrices_agree_with_the_pose_in_any_pixel_frame(focal):
     assert np.minimum(np.abs(E - truth).max(axis=(1, 2)), np.abs(E + truth).max(axis=(1, 2))).max() < 1e-5
     np.testing.assert_allclose(np.linalg.det(F[:2]), 0.0, atol=1e-15)
     assert np.isnan(F[2]).all()
+
+
+def test_keypoints_at_one_place_end_in_finite_matrices():
+    points = np.zeros((20, 2))
+    F = estimate_fundamental_from_inliers(np.array([0, 20]), points, points)
+    assert np.isfinite(F).all()
