@@ -23,6 +23,8 @@ CALIBRATED, UNCALIBRATED = 2, 3
 """COLMAP's two-view configurations of general scenes."""
 ALIKE = 0.03
 """Relative difference below which two votes are taken for one lens; lenses differ by more, or it does not matter."""
+MAX_PAIRS_PER_CAMERA = 400
+"""Pairs that vote for a camera, those of most matches."""
 MAX_MATCHES_PER_VOTE = 300
 """Matches of a pair that its vote uses, evenly over its list; more change the vote by less than its own error."""
 
@@ -120,6 +122,7 @@ def _self_calibration(
     chosen = np.flatnonzero(np.isin(tables.configs, (CALIBRATED, UNCALIBRATED)) & enough)
     if len(chosen) == 0:
         return None
+    chosen = chosen[_strongest_of_cameras(tables.camera_idx[tables.pairs[chosen]], np.diff(tables.offsets)[chosen])]
     rows, offsets = rows_of_segments(tables.offsets, chosen)
     thin = evenly_thinned(offsets, MAX_MATCHES_PER_VOTE)
     rows, offsets = rows[thin], segment_subset(offsets, thin)
@@ -136,3 +139,14 @@ def _self_calibration(
         given=given,
         aspect_ratios=np.array([c.focal_length_y / c.focal_length_x for c in tables.cameras]),
     )
+
+
+def _strongest_of_cameras(cameras: IntArray, num_matches: IntArray) -> BoolArray:
+    """Pairs (m,) that are among the strongest of one of their cameras (m, 2)."""
+    pair = np.tile(np.arange(len(cameras)), 2)
+    camera = cameras.T.ravel()
+    order = np.lexsort((pair, -num_matches[pair], camera))
+    rank = np.arange(len(order)) - np.searchsorted(camera[order], camera[order], side="left")
+    kept = np.zeros(len(cameras), dtype=bool)
+    kept[pair[order[rank < MAX_PAIRS_PER_CAMERA]]] = True
+    return kept

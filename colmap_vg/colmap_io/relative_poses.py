@@ -5,6 +5,7 @@ that are identity and zero with E filled in, homographies whose stored pose is 8
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.cameras import calibration_matrix
 from colmap_vg.colmap_io.tables import DatabaseTables
 from colmap_vg.epipolar.edge_information import refine_relative_poses
+from colmap_vg.epipolar.sampson import Matches, residuals
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.two_view.eight_point import estimate_essential_from_inliers
 from colmap_vg.two_view.essential import (
@@ -20,7 +22,6 @@ from colmap_vg.two_view.essential import (
     essential_from_pose,
     judged_poses,
     poses_from_essential,
-    sampson_errors,
 )
 from colmap_vg.two_view.homography import calibrated_homography, poses_from_homography, pure_rotations
 from colmap_vg.two_view.segments import (
@@ -58,6 +59,10 @@ MIN_FITTING_SHARE, MIN_NUM_FITTING = 0.8, 100
 calibrated pose: on repeated structure false pairs were seen to reach 74, at shares up to 0.96."""
 MAX_MATCHES_PER_POSE = 1000
 """Matches of a pair that its pose is refined on, evenly over its list."""
+MAX_MATCHES_PER_CHOICE = 150
+"""Matches by which candidates for a pair's pose are compared: their differences are gross."""
+SAME_MATRIX = 1e-8
+"""Of the cosine between matrices: 0.01 degrees, far less than the refinement moves a pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,18 +98,30 @@ class _Matches:
     bearings1: Array
     bearings2: Array
 
-    def medians(self, poses: RelativePoses) -> Array:
-        """Median Sampson error of each pair, radians; infinite for pairs without matches."""
-        return np.nan_to_num(segment_quantiles(self.offsets, self._errors(poses)), nan=np.inf)
+    @cached_property
+    def _rays(self) -> Matches:
+        variances = np.ones(len(self.offsets) - 1)
+        return Matches.of_rays(self.offsets, self.bearings1, self.bearings2, variances, variances)
 
-    def shares_within(self, poses: RelativePoses, bounds: Array) -> Array:
-        """Share of each pair's matches with a Sampson error of at most its bound (m,), radians; 0 without matches."""
-        within = self._errors(poses) <= bounds[segment_of_rows(self.offsets)]
+    def errors(self, poses: RelativePoses) -> Array:
+        """Absolute Sampson error of each match, radians."""
+        return np.abs(residuals(self._rays, poses.rotations, poses.directions))
+
+    def medians(self, errors: Array) -> Array:
+        """Median of the matches' errors of each pair; infinite for pairs without matches."""
+        return np.nan_to_num(segment_quantiles(self.offsets, errors), nan=np.inf)
+
+    def shares_within(self, errors: Array, bounds: Array) -> Array:
+        """Share of each pair's matches with an error of at most its bound (m,); 0 without matches."""
+        within = errors <= bounds[segment_of_rows(self.offsets)]
         return segment_sums(self.offsets, within.astype(np.float64)) / np.maximum(np.diff(self.offsets), 1)
 
-    def _errors(self, poses: RelativePoses) -> Array:
-        E = essential_from_pose(poses.rotations, poses.directions)
-        return np.abs(sampson_errors(E, self.offsets, self.bearings1, self.bearings2))
+    def judged(self, rotations: Array, directions: Array) -> RelativePoses:
+        return judged_poses(rotations, directions, self.offsets, self.bearings1, self.bearings2)
+
+    def of(self, pairs: IntArray) -> "_Matches":
+        rows, offsets = rows_of_segments(self.offsets, pairs)
+        return _Matches(offsets, self.bearings1[rows], self.bearings2[rows])
 
     def thinned(self, limit: int) -> "_Matches":
         thin = evenly_thinned(self.offsets, limit)
@@ -146,10 +163,11 @@ def relative_poses(
     K1, K2 = K[cameras[:, 0]], K[cameras[:, 1]]
     unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
 
-    poses = _poses_from_matrices(tables, matches, K1, K2, unchanged)
+    few = every.thinned(MAX_MATCHES_PER_CHOICE)
+    E = _essential_matrices(tables, few, K1, K2, unchanged)
+    poses = _better_of_stored_and_decomposed(tables, few, E, unchanged)
     planar = np.isin(tables.configs, (PLANAR, PLANAR_OR_PANORAMIC))
-    poses = _better_planar(tables, matches, K1, K2, planar, poses)
-    poses = _better_stored(tables, matches, unchanged, poses)
+    poses = _better_planar(tables, few, K1, K2, planar, poses)
     focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
     enough = np.diff(matches.offsets) >= max(min_num_inliers, 5)
     refined = refine_relative_poses(
@@ -163,15 +181,17 @@ def relative_poses(
     )
     rotations = np.where(enough[:, None, None], refined.rotations, poses.rotations)
     directions = np.where(enough[:, None], refined.directions, poses.directions)
-    final = judged_poses(rotations, normalized(directions), matches.offsets, matches.bearings1, matches.bearings2)
-    turned = _pure_rotation(matches, final)
+    final = matches.judged(rotations, normalized(directions))
+    errors = matches.errors(final)
+    medians, pair_focal = matches.medians(errors), np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]])
+    turned = _pure_rotation(matches, final, medians)
     final = replace(final, rotations=np.where(turned[0][:, None, None], turned[1], final.rotations))
-    error_px = matches.medians(final) * np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]])
+    error_px = medians * pair_focal
     verdicts = np.full(m, EdgeVerdict.KEPT, dtype=object)
     verdicts[turned[0] | (tables.configs == PANORAMIC)] = EdgeVerdict.ROTATION_ONLY
     unexplained = (final.share_in_front < MIN_SHARE_IN_FRONT) & (verdicts == EdgeVerdict.KEPT)
     verdicts[unexplained | ((error_px > MAX_MEDIAN_ERROR_PX) & ~turned[0])] = EdgeVerdict.NO_POSE
-    fitting = matches.shares_within(final, MAX_MEDIAN_ERROR_PX / np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]]))
+    fitting = matches.shares_within(errors, MAX_MEDIAN_ERROR_PX / pair_focal)
     unfit = (fitting < MIN_FITTING_SHARE) | (fitting * np.diff(every.offsets) < MIN_NUM_FITTING)
     verdicts[(tables.configs == UNCALIBRATED) & focal_trusted[cameras].all(axis=1) & unfit] = EdgeVerdict.UNCALIBRATED
     verdicts[tables.configs == WATERMARK] = EdgeVerdict.WATERMARK
@@ -182,10 +202,8 @@ def relative_poses(
     )
 
 
-def _poses_from_matrices(
-    tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, unchanged: BoolArray
-) -> RelativePoses:
-    """Poses from E where it was found under the same focal lengths, else from F, else refitted from the matches."""
+def _essential_matrices(tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, unchanged: BoolArray) -> Array:
+    """E where it was found under the same focal lengths, else from F, else refitted from the matches."""
     E = np.where(unchanged[:, None, None], tables.E, np.nan)
     from_F = essential_from_fundamental(tables.F, K1, K2)
     missing = ~_usable(E)
@@ -194,8 +212,33 @@ def _poses_from_matrices(
     if missing.any():
         refitted = estimate_essential_from_inliers(matches.offsets, matches.bearings1, matches.bearings2)
         E = np.where(missing[:, None, None], refitted, E)
-    E = np.where(_usable(E)[:, None, None], E, np.diag([1.0, 1.0, 0.0]))
-    return poses_from_essential(E, matches.offsets, matches.bearings1, matches.bearings2)
+    return np.where(_usable(E)[:, None, None], E, np.diag([1.0, 1.0, 0.0]))
+
+
+def _better_of_stored_and_decomposed(
+    tables: DatabaseTables, matches: _Matches, E: Array, unchanged: BoolArray
+) -> RelativePoses:
+    """Stored poses that are E's own; else of the stored pose and of E's that which the matches like more."""
+    length = np.linalg.norm(tables.translations, axis=1)
+    with np.errstate(invalid="ignore"):
+        present = unchanged & np.isfinite(tables.rotations).all(axis=(1, 2)) & (length > 0)
+    R = np.where(present[:, None, None], tables.rotations, np.eye(3))
+    t = np.where(present[:, None], tables.translations, np.array([0.0, 0.0, 1.0]))
+    d = normalized(-np.einsum("kba,kb->ka", R, t))
+    stored = matches.judged(R, d)
+    of_stored = essential_from_pose(R, d)
+    cosine = np.einsum("kab,kab->k", of_stored, E) / (
+        np.linalg.norm(E, axis=(1, 2)) * np.linalg.norm(of_stored, axis=(1, 2))
+    )
+    same = present & (np.abs(cosine) > 1.0 - SAME_MATRIX) & (stored.share_in_front > MIN_SHARE_IN_FRONT)
+    rest = np.flatnonzero(~same)
+    if not len(rest):
+        return stored
+    of_rest = matches.of(rest)
+    decomposed = poses_from_essential(E[rest], of_rest.offsets, of_rest.bearings1, of_rest.bearings2)
+    own = stored.of(rest)
+    better = present[rest] & _preferred(of_rest, own, decomposed)
+    return stored.replaced(rest, _where(better, own, decomposed))
 
 
 def _better_planar(
@@ -212,50 +255,26 @@ def _better_planar(
     return _where(with_H & _preferred(matches, found.better, poses), found.better, poses)
 
 
-def _better_stored(
-    tables: DatabaseTables, matches: _Matches, unchanged: BoolArray, poses: RelativePoses
-) -> RelativePoses:
-    """The stored pose where there is one and the matches like it more."""
-    length = np.linalg.norm(tables.translations, axis=1)
-    with np.errstate(invalid="ignore"):
-        present = unchanged & np.isfinite(tables.rotations).all(axis=(1, 2)) & (length > 0)
-    if not present.any():
-        return poses
-    R = np.where(present[:, None, None], tables.rotations, np.eye(3))
-    t = np.where(present[:, None], tables.translations, np.array([0.0, 0.0, 1.0]))
-    directions = normalized(-np.einsum("kba,kb->ka", R, t))
-    stored = judged_poses(R, directions, matches.offsets, matches.bearings1, matches.bearings2)
-    return _where(present & _preferred(matches, stored, poses), stored, poses)
-
-
 def _preferred(matches: _Matches, one: RelativePoses, other: RelativePoses) -> BoolArray:
     """Whether the matches like one pose more: clearly more of them in front, or as many and a lower median error."""
     margin = 0.1
     ahead = one.share_in_front - other.share_in_front
-    closer = matches.medians(one) < matches.medians(other)
+    closer = matches.medians(matches.errors(one)) < matches.medians(matches.errors(other))
     return np.asarray((ahead > margin) | ((ahead > -margin) & closer))
 
 
 def _where(mask: BoolArray, one: RelativePoses, other: RelativePoses) -> RelativePoses:
-    def pick(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np.generic]:
-        return np.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-
-    return RelativePoses(
-        np.asarray(pick(one.rotations, other.rotations), dtype=float),
-        np.asarray(pick(one.directions, other.directions), dtype=float),
-        np.asarray(pick(one.num_in_front, other.num_in_front), dtype=np.int64),
-        np.asarray(pick(one.share_in_front, other.share_in_front), dtype=float),
-        np.asarray(pick(one.median_angles, other.median_angles), dtype=float),
-    )
+    rows = np.flatnonzero(mask)
+    return other.replaced(rows, one.of(rows))
 
 
-def _pure_rotation(matches: _Matches, poses: RelativePoses) -> tuple[BoolArray, Array]:
+def _pure_rotation(matches: _Matches, poses: RelativePoses, medians: Array) -> tuple[BoolArray, Array]:
     """Which pairs a rotation alone explains about as well, and that rotation."""
     turned, rotations = poses.median_angles < MIN_ANGLE, poses.rotations.copy()
     suspects = np.flatnonzero(poses.median_angles < MAX_SPURIOUS_ANGLE)
-    rows, offsets = rows_of_segments(matches.offsets, suspects)
-    found = pure_rotations(offsets, matches.bearings1[rows], matches.bearings2[rows])
-    expected = ROTATION_NOISE * np.maximum(matches.medians(poses)[suspects], 1e-4)
+    of_suspects = matches.of(suspects)
+    found = pure_rotations(of_suspects.offsets, of_suspects.bearings1, of_suspects.bearings2)
+    expected = ROTATION_NOISE * np.maximum(medians[suspects], 1e-4)
     turned[suspects] |= found.median_errors <= ROTATION_SHARE * expected
     rotations[suspects] = found.rotations
     return turned, rotations

@@ -133,10 +133,12 @@ def _worthy_pairs(
 ) -> IntArray:
     """Pairs (q, 2) of half-edges that share keypoints of an image, the worthiest of each image, in rising order."""
     rows, offsets = rows_of_segments(half_offsets, chosen)
-    width = int(keypoints.max(initial=0)) + 1
-    column = middle[segment_of_rows(offsets)] * width + keypoints[rows]
-    _, column = np.unique(column, return_inverse=True)
-    size = (len(chosen), int(column.max(initial=0)) + 1)
+    image = middle[segment_of_rows(offsets)]
+    # A column for each keypoint of each image.
+    highest = np.zeros(int(middle.max(initial=0)) + 1, dtype=np.int64)
+    np.maximum.at(highest, image, keypoints[rows] + 1)
+    column = (np.cumsum(highest) - highest)[image] + keypoints[rows]
+    size = (len(chosen), int(highest.sum()))
     seen = sp.csr_array((sine[rows], column, offsets), shape=size)
     ones = sp.csr_array((np.ones(len(rows)), column, offsets), shape=size)
     count = sp.coo_array(sp.triu(ones @ ones.T, k=1))

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
+from colmap_vg.mapping.bundle import adjust_bundle
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
     MIN_TRIANGULATION_ANGLE_DEG,
-    bundle_options,
     mapper_options,
     triangulator_options,
 )
@@ -84,7 +83,7 @@ def build_model(
         mapper.complete_and_merge_tracks(triangulator)
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):
-        left, enough = _adjust(mapper, options, max_num_iterations=15, function_tolerance=1e-4), GOOD_START_COST
+        left, enough = _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4), GOOD_START_COST
         for _ in range(MAX_NUM_ROUNDS):
             mapper.complete_and_merge_tracks(triangulator)
             mapper.retriangulate(triangulator)
@@ -102,7 +101,7 @@ def build_model(
         removed -= added
         if added or removed:
             mapper.complete_and_merge_tracks(triangulator)
-            _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
+            _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-4)
             again = _remove_unsupported(mapper)
             removed, added = removed | again, added - again
         log.result(f"{len(added)} images added, {len(removed)} removed")
@@ -153,20 +152,12 @@ def extract_colors(
 def _adjust(
     mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, max_num_iterations: int, function_tolerance: float
 ) -> float:
-    """One round on tracks of three views or more, then the filter; the share of its cost that the round left."""
-    reconstruction = mapper.reconstruction
-    bundle = bundle_options(
-        options, max_num_iterations=max_num_iterations, function_tolerance=function_tolerance, min_track_length=3
+    """One round of bundle adjustment, then the filter; the share of its cost that the round left."""
+    left = adjust_bundle(
+        mapper.reconstruction, options, max_num_iterations=max_num_iterations, function_tolerance=function_tolerance
     )
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in sorted(reconstruction.reg_image_ids()):
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    summary = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
     _filter(mapper)
-    # A model without an observation to adjust by has no such summary.
-    costs = getattr(summary, "ceres_summary", None)
-    return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
+    return left
 
 
 def _filter(mapper: "pycolmap.IncrementalMapper") -> None:

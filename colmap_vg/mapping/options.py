@@ -7,6 +7,8 @@ from colmap_vg.options import MappingOptions
 MAX_REPROJECTION_PX = 4.0
 MIN_TRIANGULATION_ANGLE_DEG = 1.5
 """COLMAP's own thresholds for points."""
+MIN_TRACK_LENGTH = 3
+"""Of points that adjust cameras."""
 
 
 def triangulator_options(options: MappingOptions) -> "pycolmap.IncrementalTriangulatorOptions":
@@ -32,19 +34,24 @@ def mapper_options(options: MappingOptions) -> "pycolmap.IncrementalMapperOption
 
 
 def bundle_options(
-    options: MappingOptions, *, max_num_iterations: int, function_tolerance: float, min_track_length: int
+    options: MappingOptions, *, loss_scale_px: float, max_num_iterations: int, function_tolerance: float
 ) -> "pycolmap.BundleAdjustmentOptions":
-    """Bundle adjustment with a Cauchy loss of one pixel: Huber ends worse, two-view tracks pull it away."""
+    """Bundle adjustment with a Cauchy loss: Huber ends worse.
+
+    The trust region is wide from the start. Poses come nearly right, and what a narrow one holds back is what the
+    points fix least: the bend of a long street took three times the steps.
+    """
     bundle = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=options.ba_refine_focal_length,
         refine_principal_point=options.ba_refine_principal_point,
         refine_extra_params=options.ba_refine_extra_params,
-        min_track_length=min_track_length,
+        min_track_length=MIN_TRACK_LENGTH,
         print_summary=False,
     )
     bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    bundle.ceres.loss_function_scale = 1.0
+    bundle.ceres.loss_function_scale = loss_scale_px
     bundle.ceres.solver_options.max_num_iterations = max_num_iterations
     bundle.ceres.solver_options.function_tolerance = function_tolerance
+    bundle.ceres.solver_options.initial_trust_region_radius = 1e8
     bundle.ceres.solver_options.num_threads = options.num_threads
     return bundle

@@ -1,5 +1,7 @@
 """How many observations really fix each image: those of points that three views see at an angle."""
 
+from itertools import chain
+
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -25,26 +27,25 @@ def supported_observations(
     dict of image id to int
     """
     image_ids = sorted(reconstruction.reg_image_ids())
-    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
-    centers = np.array([reconstruction.image(i).projection_center() for i in image_ids]).reshape(-1, 3)
-    points: list[Array] = []
-    lengths: list[int] = []
-    rows: list[int] = []
-    for point in reconstruction.points3D.values():
-        elements = point.track.elements
-        if len(elements) >= min_track_length:
-            points.append(point.xyz)
-            lengths.append(len(elements))
-            rows.extend(row_of[e.image_id] for e in elements)
-    if not points:
+    seen = [reconstruction.image(i).get_observation_points2D() for i in image_ids]
+    point_ids = np.array([p.point3D_id for p in chain.from_iterable(seen)], dtype=np.int64)
+    image_row = np.repeat(np.arange(len(image_ids)), [len(s) for s in seen])
+    _, row, length = np.unique(point_ids, return_inverse=True, return_counts=True)
+    by_point = np.argsort(row, kind="stable")
+    by_point = by_point[length[row[by_point]] >= min_track_length]
+    image_row = image_row[by_point]
+    long, point_row = np.unique(point_ids[by_point], return_inverse=True)
+    if len(long) == 0:
         return dict.fromkeys(image_ids, 0)
-    image_row, offsets = np.array(rows), np.concatenate([[0], np.cumsum(lengths)])
-    point_row = np.repeat(np.arange(len(points)), lengths)
-    rays = centers[image_row] - np.array(points)[point_row]
+    centers = np.array([reconstruction.image(i).projection_center() for i in image_ids])
+    points = reconstruction.points3D
+    positions = np.array([points[i].xyz for i in long.tolist()])
+    rays = centers[image_row] - positions[point_row]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    offsets = np.searchsorted(point_row, np.arange(len(long) + 1))
     wide = _widest_angles(rays, offsets) >= np.radians(min_angle_deg)
     counts = np.bincount(image_row[wide[point_row]], minlength=len(image_ids))
-    return {image_id: int(counts[row]) for image_id, row in row_of.items()}
+    return dict(zip(image_ids, counts.tolist(), strict=True))
 
 
 def _widest_angles(rays: Array, offsets: NDArray[np.int64]) -> Array:

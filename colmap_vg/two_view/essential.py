@@ -5,7 +5,7 @@ With ``cam2_from_cam1 = (R, t)`` a match obeys ``x2^T E x1 = 0``, ``E = [t]_x R 
 §9.6).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,17 @@ class RelativePoses:
     num_in_front: IntArray
     share_in_front: Array
     median_angles: Array
+
+    def of(self, edges: IntArray) -> "RelativePoses":
+        """Those of some edges, in their order."""
+        return RelativePoses(*(getattr(self, f.name)[edges] for f in fields(self)))
+
+    def replaced(self, edges: IntArray, others: "RelativePoses") -> "RelativePoses":
+        """The same with other poses for some edges (e,)."""
+        columns = [getattr(self, f.name).copy() for f in fields(self)]
+        for column, f in zip(columns, fields(self), strict=True):
+            column[edges] = getattr(others, f.name)
+        return RelativePoses(*columns)
 
 
 def essential_from_pose(rotations: Array, directions: Array) -> Array:

@@ -76,12 +76,13 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
         num_threads=3,
         random_seed=7,
     )
-    bundle = bundle_options(options, max_num_iterations=11, function_tolerance=1e-4, min_track_length=3)
+    bundle = bundle_options(options, loss_scale_px=0.7, max_num_iterations=11, function_tolerance=1e-4)
     assert (bundle.refine_focal_length, bundle.refine_principal_point) == (switch, not switch)
     assert bundle.refine_extra_params == switch
     assert bundle.min_track_length == 3
     assert not bundle.print_summary
     assert bundle.ceres.loss_function_type == pycolmap.LossFunctionType.CAUCHY
+    assert bundle.ceres.loss_function_scale == 0.7
     solver = bundle.ceres.solver_options
     assert (solver.max_num_iterations, solver.function_tolerance, solver.num_threads) == (11, 1e-4, 3)
     mapper = mapper_options(options)
