@@ -11,7 +11,7 @@ FOCAL = 900.0
 
 def scene(seed, *, num_points=30, num_views=4, sigma_px=0.5):
     rng = np.random.default_rng(seed)
-    X = rng.uniform(-1, 1, (num_points, 3)) + [0, 0, 6]
+    X = rng.uniform([-1, -1, 5], [1, 1, 7], (num_points, 3))
     point_row = np.repeat(np.arange(num_points), num_views)
     centers = rng.normal(0, 0.5, (len(point_row), 3))
     noise = sigma_px / FOCAL * rng.standard_normal((len(point_row), 3))
@@ -40,7 +40,7 @@ def test_points_end_at_the_robust_minimum():
 
 def test_exact_rays_give_exact_points_and_a_false_one_does_not_pull():
     X, point_row, rays, centers = scene(2, num_views=6, sigma_px=0.0)
-    rays[::6] = normalized(rays[::6] + [0.05, 0.0, 0.0])
+    rays[::6] = normalized(rays[::6] + np.array([0.05, 0.0, 0.0]))
     start = X + 0.01 * np.random.default_rng(3).standard_normal(X.shape)
     found = refine_points(start, point_row, rays, centers, np.full(len(rays), FOCAL), num_iterations=30)
     assert np.linalg.norm(found - X, axis=1).max() < 2e-3
