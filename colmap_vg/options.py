@@ -6,7 +6,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from colmap_vg.errors import OptionError
 
-Method = Literal["epipolar", "1C", "1O", "2C", "2O", "cls", "cle1", "cross", "orthogonal", "lud", "shapefit", "bata"]
+Method = Literal[
+    "epipolar", "1C", "1O", "2C", "2O", "2W", "cls", "cle1", "cross", "orthogonal", "lud", "shapefit", "bata"
+]
 OutlierFilter = Literal["robust", "1dsfm", "none"]
 RotationAveraging = Literal["robust", "chordal"]
 CameraMode = Literal["auto", "single", "per_folder", "per_image"]
@@ -63,8 +65,8 @@ class SolveOptions(_Checked):
     one_dsfm_num_directions: int = _number(48, 1)
     direction_gate_deg: float = _number(15.0, 0.0, 180.0)  # degrees; robust filter of directions; 0: no gate
     edge_weights: Literal["unit", "inliers", "information"] = "information"  # inliers: sqrt(number), planar a third
-    accelerate: bool = True  # Anderson acceleration of the outer iterations of 1C, 1O, 2C, 2O; same fixed point
-    max_num_iterations: int = _number(1000, 1)  # outer iterations of 1C, 1O, 2C, 2O
+    accelerate: bool = True  # Anderson acceleration of those of 1C, 1O, 2C, 2O, 2W; same fixed point
+    max_num_iterations: int = _number(1000, 1)  # outer iterations of 1C, 1O, 2C, 2O, 2W
     convergence_tolerance: float = _number(1e-6, 0.0, 1.0)  # relative change of positions between outer iterations
     covariances: bool = False  # of the cameras that the epipolar adjustment finds; a fifth of the solver's time more
     refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal was not given

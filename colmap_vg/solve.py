@@ -16,6 +16,7 @@ from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
 from colmap_vg.epipolar.baseline_lengths import connects_all, length_links, positions_by_lengths, solve_lengths
 from colmap_vg.epipolar.covariance import camera_covariances
 from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
+from colmap_vg.errors import GraphError
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.joint.alternation import solve_joint
@@ -286,6 +287,15 @@ def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOp
         )
         ledger.log.extend(fixed.log)
         return replace(poses, centers=fixed.projection_centers, converged=fixed.converged)
+    information = None
+    if method == "2W":
+        if graph.edge_information is None:
+            raise GraphError(
+                "method 2W weighs edges by their information, and the graph holds none: read it from a database, set"
+                " ViewGraph.edge_information, or solve with method 2C or 2O"
+            )
+        information = graph.edge_information[part.edge_rows]
+        information = information / np.median(information[:, 3, 3])
     joint = solve_joint(
         n,
         part.edges,
@@ -294,7 +304,9 @@ def _solve_poses(ledger: Ledger, part: Subgraph, poses: _Poses, options: SolveOp
         poses.rotations,
         start.projection_centers,
         "C" if method == "2C" else "O",
-        weights,
+        None if method == "2W" else weights,
+        information=information,
+        robust=method == "2W",
         accelerate=options.accelerate,
         max_num_iterations=options.max_num_iterations,
         tolerance=options.convergence_tolerance,

@@ -23,7 +23,7 @@ IntArray = NDArray[np.int64]
 
 Layout = Literal["street", "ring", "clusters", "collinear"]
 MEDIAN_INLIERS = 80.0
-"""Matches of the median edge; spread log-normally, as in real databases, by a factor of e^0.8."""
+"""Matches of the median edge; spread log-normally, as in real databases."""
 MIN_STATED_SIGMA_DEG = 1e-3
 """Least standard deviation in the graph's information matrices: exact edges would know infinitely much."""
 
@@ -41,6 +41,8 @@ class TopologyNoise:
         at fixed depth.
     max_direction_deg : float
         Cap of the direction noise.
+    match_spread : float
+        Logarithms of the numbers of matches have this standard deviation; noise goes with their inverse square root.
     outlier_share : float
         Edges with a random relative pose, 0 to 1.
     false_cluster_share : float
@@ -51,6 +53,7 @@ class TopologyNoise:
     direction_deg: float = 2.0
     baseline_power: float = 1.0
     max_direction_deg: float = 20.0
+    match_spread: float = 0.8
     outlier_share: float = 0.0
     false_cluster_share: float = 0.0
 
@@ -143,7 +146,9 @@ def _measured(R: Array, p: Array, edges: IntArray, noise: TopologyNoise, rng: np
     i, j = edges[:, 0], edges[:, 1]
     m = len(edges)
     baseline = np.linalg.norm(p[j] - p[i], axis=1)
-    inliers = np.maximum(np.round(MEDIAN_INLIERS * np.exp(0.8 * rng.standard_normal(m))), 16).astype(np.int64)
+    inliers = np.maximum(np.round(MEDIAN_INLIERS * np.exp(noise.match_spread * rng.standard_normal(m))), 16).astype(
+        np.int64
+    )
     fewness = np.sqrt(MEDIAN_INLIERS / inliers)
     shortness = (np.median(baseline) / np.maximum(baseline, 1e-9)) ** noise.baseline_power
     rotation_sigma = np.radians(noise.rotation_deg) * fewness

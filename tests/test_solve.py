@@ -18,6 +18,7 @@ from colmap_vg import (
     solve_view_graph,
 )
 from colmap_vg.colmap_io.synthetic_database import write_synthetic_database
+from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.synthetic import ring_scene
 from colmap_vg.synthetic_views import synthetic_views
@@ -230,3 +231,11 @@ def test_false_pairs_across_a_long_street_neither_fold_it_nor_take_its_images(tm
     assert solution.registered.all()
     errors, _ = align_positions(solution.projection_centers, views.projection_centers)
     assert errors.max() < 0.2  # metres, of two hundred
+
+
+def test_the_weighted_form_needs_information():
+    scene = ring_scene(12, 4, seed=0)
+    with pytest.raises(GraphError, match="2W"):
+        solve_view_graph(replace(scene.graph, edge_information=None), SolveOptions(method="2W"))
+    informed = replace(scene.graph, edge_information=np.tile(np.eye(5), (scene.graph.num_edges, 1, 1)))
+    assert _errors(solve_view_graph(informed, SolveOptions(method="2W")), scene).max() < 1e-8

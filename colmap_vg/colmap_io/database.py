@@ -54,7 +54,7 @@ def reading(database_path: str | PathLike[str]) -> Iterator[sqlite3.Connection]:
             if "locked" in str(error):
                 raise _written_by_another(path) from error
             raise DatabaseError(f"{database_path}: the database cannot be read ({error}); make it again") from error
-        except OverflowError as error:
+        except (OverflowError, UnicodeDecodeError) as error:  # also of sqlite's own message, when it quotes the damage
             raise DatabaseError(f"{database_path}: the database is damaged ({error}); make it again") from error
         if not before.sides and _state(path) != before:
             raise _written_by_another(path)

@@ -106,6 +106,15 @@ def test_another_sqlite_file_is_no_colmap_database(sound: Path, tmp_path: Path) 
             read(path)
 
 
+def test_a_schema_that_is_no_text_is_named_whatever_sqlite_says_of_it(sound: Path, tmp_path: Path) -> None:
+    path = tmp_path / "schema.db"
+    content = sound.read_bytes()
+    assert b"CREATE TABLE cameras" in content
+    path.write_bytes(content.replace(b"CREATE TABLE cameras", b"CREATE TABL\xd6 \xd6ameras"))
+    with pytest.raises(DatabaseError, match=r"schema\.db"):
+        check_database(path)
+
+
 def test_rigs_are_refused_before_work_starts(tmp_path: Path) -> None:
     make_database(tmp_path / "rig.db", num_images=6, num_points=40, num_cameras_per_rig=2)
     with pytest.raises(DatabaseError, match="rig 1 has 2 sensors; rigs are not supported yet"):

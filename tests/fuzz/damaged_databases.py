@@ -124,7 +124,8 @@ def _blob(connection: Connection, rng: Generator) -> tuple[str, str, type, int, 
     table, column, kind = BLOBS[int(rng.integers(len(BLOBS)))]
     row = _row(connection, table, rng)
     found = connection.execute(f"SELECT {column} FROM {table} WHERE rowid = ?", (row,)).fetchone()
-    return table, column, kind, row, found[0] if found and isinstance(found[0], bytes) else b""
+    sound = found is not None and isinstance(found[0], bytes) and len(found[0]) % np.dtype(kind).itemsize == 0
+    return table, column, kind, row, found[0] if sound else b""
 
 
 def odd_number_in_a_blob(connection: Connection, rng: Generator) -> None:

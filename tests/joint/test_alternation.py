@@ -9,6 +9,7 @@ from colmap_vg import align_positions
 from colmap_vg.geometry import so3
 from colmap_vg.joint.alternation import solve_joint
 from colmap_vg.joint.pose_graph import solve_pose_graph
+from colmap_vg.metrics import rotation_errors
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.synthetic import ring_scene
@@ -125,6 +126,29 @@ def test_weighing_edges_by_their_information_halves_the_error():
         assert result.converged
         errors.append(np.mean(align_positions(result.projection_centers, scene.projection_centers)[0]))
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_the_weighted_form_forgets_false_edges_and_rotations_gain():
+    n, rng = 40, np.random.default_rng(1)
+    scene, (_, edges, relative, directions, _R, p) = _started(n, 10, rotation_sigma=0.0, direction_sigma=0.0, seed=3)
+    sigma = 10.0 ** rng.uniform(-3.0, -1.5, len(edges))
+    relative = so3.exp(sigma[:, None] * rng.standard_normal((len(edges), 3))) @ relative
+    directions = np.einsum("kab,kb->ka", so3.exp(sigma[:, None] * rng.standard_normal((len(edges), 3))), directions)
+    false = rng.random(len(edges)) < 0.1
+    relative[false] = so3.exp(0.3 * rng.standard_normal((false.sum(), 3))) @ relative[false]
+    directions[false] = np.einsum("kab,kb->ka", so3.random(false.sum(), rng), directions[false])
+    # Stated three times too sure, all alike: the loss's scale makes up for it.
+    information = np.eye(5) * (3.0 / sigma[:, None, None]) ** 2
+    rough = average_rotations_chordal(n, edges, relative).cam_from_world_rotations
+    positions, rotations = [], []
+    for kwargs in ({}, {"information": information}, {"information": information, "robust": True}):
+        result = solve_joint(n, edges, relative, directions, rough, p, "O", **kwargs)
+        positions.append(np.median(align_positions(result.projection_centers, scene.projection_centers)[0]))
+        rotations.append(rotation_errors(result.cam_from_world_rotations, scene.cam_from_world_rotations).median_deg)
+    assert positions[2] < 0.5 * positions[1]
+    assert positions[2] < 0.1 * positions[0]
+    assert rotations[2] < 0.5 * rotation_errors(rough, scene.cam_from_world_rotations).median_deg
+    assert result.log[0].stage == "2W"
 
 
 @settings(max_examples=5, deadline=None)
