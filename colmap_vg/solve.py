@@ -57,7 +57,7 @@ those that leave together none is three times as certain as another."""
 CONTRADICTION = 10.0
 """Residuals of a pair over those of the median pair, in standard deviations, from which on it is false. What all pairs
 share, a lens not quite as modelled, is in the median; noise of one pair does not reach five."""
-TRUST_PER_MEDIAN, TRUST_SCALES_DEG = 5.0, (0.5, 10.0)
+TRUST_PER_MEDIAN, TRUST_SCALES_DEG = 20.0, (3.0, 10.0)
 """Geman-McClure scale of what a rotation's residual says of the direction, over the median residual, and its range. A
 false pair across a long street would otherwise fold it: it costs more displacement than tearing a street apart."""
 TRIAL_SHARE = 0.25

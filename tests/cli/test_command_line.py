@@ -339,7 +339,12 @@ def test_run_goes_from_photographs_to_a_model(tmp_path: Path, images_path: Path)
 def test_ctrl_c_ends_with_130_and_leaves_no_model(tmp_path: Path, images_path: Path) -> None:
     arguments = ["run", "--image_path", images_path, "--output_path", tmp_path / "out", "--verbose"]
     with subprocess.Popen(
-        [*COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*COMMAND, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Shells start what runs in the background deaf to Ctrl-C, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         for line in process.stdout:
             if line.startswith("features: started"):

@@ -25,8 +25,15 @@ def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "colmap_vg", *map(str, arguments)]
 
 
+def hearing_ctrl_c() -> None:
+    """Shells start what runs in the background deaf to it, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(*arguments: object) -> "subprocess.Popen[str]":
-    return subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hearing_ctrl_c
+    )
 
 
 def finish(*arguments: object) -> subprocess.CompletedProcess[str]:
