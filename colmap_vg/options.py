@@ -11,8 +11,9 @@ Method = Literal[
 ]
 OutlierFilter = Literal["robust", "1dsfm", "none"]
 RotationAveraging = Literal["robust", "chordal"]
+Quality = Literal["low", "medium", "high", "extreme"]
 CameraMode = Literal["auto", "single", "per_folder", "per_image"]
-Matching = Literal["exhaustive", "sequential", "spatial"]
+Matching = Literal["auto", "exhaustive", "selected", "sequential", "spatial"]
 
 
 def _number(default: float, low: float, high: float = float("inf")) -> Any:
@@ -81,7 +82,7 @@ class FeatureOptions(_Checked):
     camera_model: str = "SIMPLE_RADIAL"
     camera_params: tuple[float, ...] = ()  # in the model's order, pixels; empty: from EXIF, else guessed
     camera_mode: CameraMode = "auto"  # auto: COLMAP's, which shares a camera only where EXIF says so
-    matching: Matching = "exhaustive"
+    matching: Matching = "auto"  # exhaustive, in folders of more than 60 images selected: by their largest features
     image_list_path: str | PathLike[str] | None = None  # file with one image name a line; None: all of the folder
     mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png for image NAME; black hides features
     max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are shrunk for extraction; -1: COLMAP's
@@ -89,6 +90,15 @@ class FeatureOptions(_Checked):
     sequential_overlap: int = _number(10, 1)  # images; each is matched with so many followers
     num_threads: int = _number(-1, -1)  # -1: all cores
     random_seed: int = _number(0, 0)
+
+
+QUALITIES: dict[Quality, tuple[int, int]] = {
+    "low": (1000, 2048),
+    "medium": (1600, 4096),
+    "high": (-1, 8192),
+    "extreme": (100_000, 16384),
+}
+"""Longer side of the images in pixels, as `FeatureOptions.max_image_size`, and features per image."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from colmap_vg._version import __version__
 from colmap_vg.cli import colmap_flags
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.errors import ColmapVgError, OptionError
-from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.options import QUALITIES, FeatureOptions, MappingOptions, ReadOptions, SolveOptions
 from colmap_vg.options import Method as SolverMethod
 
 INTERRUPTED = 130
@@ -45,7 +45,12 @@ CameraMode = Annotated[
     str, typer.Option("--camera_mode", metavar="auto|single|per_folder|per_image", help="Which images share a camera.")
 ]
 Matching = Annotated[
-    str, typer.Option("--matching", metavar="exhaustive|sequential|spatial", help="Which pairs are matched.")
+    str,
+    typer.Option(
+        "--matching",
+        metavar="auto|exhaustive|selected|sequential|spatial",
+        help="Which pairs are matched; auto: all, in folders of more than 60 images the selected ones.",
+    ),
 ]
 ImageListPath = Annotated[
     Path | None, typer.Option("--image_list_path", help="Text file with one image name a line: only these are used.")
@@ -53,8 +58,12 @@ ImageListPath = Annotated[
 MaskPath = Annotated[
     Path | None, typer.Option("--mask_path", help="Folder of masks, NAME.png for image NAME; black hides features.")
 ]
-MaxImageSize = Annotated[int, typer.Option("--max_image_size", help="Pixels; -1: COLMAP's default.")]
-MaxNumFeatures = Annotated[int, typer.Option("--max_num_features", help="SIFT features per image, at most.")]
+QualityFlag = Annotated[
+    str,
+    typer.Option("--quality", metavar="|".join(QUALITIES), help="Image size and features, where not given themselves."),
+]
+MaxImageSize = Annotated[int | None, typer.Option("--max_image_size", help="Pixels; -1: COLMAP's default.")]
+MaxNumFeatures = Annotated[int | None, typer.Option("--max_num_features", help="SIFT features per image, at most.")]
 Method = Annotated[str, typer.Option("--method", metavar=METHODS, help="How positions are solved.")]
 RotationAveraging = Annotated[str, typer.Option("--rotation_averaging", metavar="robust|chordal")]
 OutlierFilter = Annotated[str, typer.Option("--outlier_filter", metavar="robust|1dsfm|none")]
@@ -117,11 +126,12 @@ def run(
     camera_model: CameraModel = "SIMPLE_RADIAL",
     camera_params: CameraParams = "",
     camera_mode: CameraMode = "auto",
-    matching: Matching = "exhaustive",
+    matching: Matching = "auto",
+    quality: QualityFlag = "high",
     image_list_path: ImageListPath = None,
     mask_path: MaskPath = None,
-    max_image_size: MaxImageSize = -1,
-    max_num_features: MaxNumFeatures = 8192,
+    max_image_size: MaxImageSize = None,
+    max_num_features: MaxNumFeatures = None,
     method: Method = DEFAULTS.solve.method,
     rotation_averaging: RotationAveraging = DEFAULTS.solve.rotation_averaging,
     outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
@@ -146,6 +156,7 @@ def run(
 ) -> None:
     """From a folder of photographs to models: features, matching, viewing graph, triangulation, bundle adjustment."""
     with _job(quiet, verbose) as reporter:
+        size, number = _quality(quality)
         features = FeatureOptions(
             camera_model=camera_model,
             camera_params=_numbers("--camera_params", camera_params),
@@ -153,8 +164,8 @@ def run(
             matching=matching,  # type: ignore[arg-type]
             image_list_path=image_list_path,
             mask_path=mask_path,
-            max_image_size=max_image_size,
-            max_num_features=max_num_features,
+            max_image_size=size if max_image_size is None else max_image_size,
+            max_num_features=number if max_num_features is None else max_num_features,
             num_threads=num_threads,
             random_seed=_seed(random_seed),
         )
@@ -378,6 +389,13 @@ def _numbers(flag: str, text: str) -> tuple[float, ...]:
         return tuple(float(part) for part in text.split(",")) if text.strip() else ()
     except ValueError:
         raise typer.BadParameter(f"{flag} takes numbers separated by commas, found {text!r}") from None
+
+
+def _quality(name: str) -> tuple[int, int]:
+    for quality, size_and_number in QUALITIES.items():
+        if quality == name:
+            return size_and_number
+    raise OptionError(f"--quality is {name!r}; choose one of {', '.join(QUALITIES)}")
 
 
 def _seed(random_seed: int) -> int:

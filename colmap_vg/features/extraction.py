@@ -10,11 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
 
 from colmap_vg.errors import ImageFolderError, OptionError
+from colmap_vg.features.pair_selection import largest_features, promising_pairs
 from colmap_vg.features.photographs import SkippedFile, find_photographs, split_odd_sizes, split_unmasked
 from colmap_vg.options import FeatureOptions
 from colmap_vg.stages import StageLog
@@ -24,6 +26,8 @@ MIN_IMAGES = 3
 
 UNREADABLE = "COLMAP cannot read it"
 
+MAX_EXHAUSTIVE = 60
+"""Images; in larger folders pairs are chosen before they are matched, unless asked otherwise."""
 IMAGES_PER_CALL = 8
 """Images per thread and call of pycolmap: progress is told between calls, and a call ends with idle threads."""
 
@@ -279,7 +283,16 @@ def _match(database_path: str | PathLike[str], options: FeatureOptions, log: Sta
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = options.random_seed
     device = pycolmap.Device.cpu
-    if options.matching == "exhaustive":
+    chosen = None
+    if options.matching == "selected" or (options.matching == "auto" and _num_images(database_path) > MAX_EXHAUSTIVE):
+        chosen = _select_pairs(Path(database_path), options, log)
+    if chosen is not None:
+        with TemporaryDirectory() as folder:
+            listed = pycolmap.ImportedPairingOptions()
+            listed.match_list_path = str(Path(folder) / "pairs.txt")
+            Path(listed.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in chosen), encoding="utf-8")
+            pycolmap.match_image_pairs(database_path, matching, listed, verification, device)
+    elif options.matching in ("auto", "exhaustive"):
         pairing = pycolmap.ExhaustivePairingOptions()
         pycolmap.match_exhaustive(database_path, matching, pairing, verification, device)
     elif options.matching == "sequential":
@@ -297,6 +310,25 @@ def _match(database_path: str | PathLike[str], options: FeatureOptions, log: Sta
         num_verified = sum(count > 0 for count in database.read_two_view_geometry_num_inliers()[1])
     log.result(f"{num_verified} verified of {num_matched} matched pairs")
     return int(num_verified)
+
+
+def _select_pairs(database_path: Path, options: FeatureOptions, log: StageLog) -> list[tuple[str, str]] | None:
+    """Names of the pairs to match; None where names with spaces cannot stand in COLMAP's list of pairs."""
+    with pycolmap.Database.open(database_path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+    if any(len(name.split()) != 1 for name in names.values()):
+        log.warn("All pairs are matched: names of photographs with spaces in them do not go into a list of pairs.")
+        return None
+    log.progress("choosing pairs")
+    threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
+    pairs = promising_pairs(largest_features(database_path), threads)
+    log.progress(f"{len(pairs)} of {len(names) * (len(names) - 1) // 2} pairs are worth matching")
+    return [(names[a], names[b]) for a, b in pairs.tolist()]
+
+
+def _num_images(database_path: str | PathLike[str]) -> int:
+    with pycolmap.Database.open(database_path) as database:
+        return int(database.num_images())
 
 
 def _require_positions(database_path: str | PathLike[str]) -> None:

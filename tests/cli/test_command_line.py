@@ -94,6 +94,7 @@ def summary(output_path: Path) -> dict[str, object]:
         ["run", "--image_path", "a"],
         ["run", "--image_path", "a", "--output_path", "b", "--camera_mode", "shared"],
         ["run", "--image_path", "a", "--output_path", "b", "--matching", "vocabulary"],
+        ["run", "--image_path", "a", "--output_path", "b", "--quality", "best"],
         ["run", "--image_path", "a", "--output_path", "b", "--camera_params", "a,b"],
         ["run", "--image_path", "a", "--output_path", "b", "--Mapper.max_num_models", "1"],
         ["mapper", "--database_path", "a", "--output_path", "b", "--Mapper.no_such_flag", "1"],

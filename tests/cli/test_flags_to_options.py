@@ -120,6 +120,17 @@ def test_feature_flags(jobs: Jobs) -> None:
     assert arguments[4] is True
 
 
+def test_quality_sets_what_is_not_given(jobs: Jobs) -> None:
+    def features(*flags: str) -> tuple[int, int]:
+        options = called(jobs, "run", "--image_path", "i", "--output_path", "o", *flags)[2]
+        return options.max_image_size, options.max_num_features
+
+    assert features() == features("--quality", "high") == (-1, 8192)
+    assert features("--quality", "low") == (1000, 2048)
+    assert features("--quality", "low", "--max_num_features", "99") == (1000, 99)
+    assert features("--max_image_size", "500", "--quality", "extreme") == (500, 16384)
+
+
 def test_demo_flags(jobs: Jobs) -> None:
     assert called(jobs, "demo", "--output_path", "o")[:3] == (Path("o"), 24, 0)
     assert called(jobs, "demo", "--output_path", "o", "--num_images", "6", "--seed", "5")[:3] == (Path("o"), 6, 5)
