@@ -292,7 +292,7 @@ def _match(database_path: str | PathLike[str], options: FeatureOptions, log: Sta
             listed.match_list_path = str(Path(folder) / "pairs.txt")
             Path(listed.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in chosen), encoding="utf-8")
             pycolmap.match_image_pairs(database_path, matching, listed, verification, device)
-    elif options.matching in ("auto", "exhaustive"):
+    elif options.matching in ("auto", "exhaustive", "selected"):
         pairing = pycolmap.ExhaustivePairingOptions()
         pycolmap.match_exhaustive(database_path, matching, pairing, verification, device)
     elif options.matching == "sequential":
