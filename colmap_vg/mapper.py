@@ -24,6 +24,7 @@ from colmap_vg.mapping.build import (
     build_model,
     extract_colors,
 )
+from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.options import MappingOptions
 from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
@@ -173,10 +174,10 @@ def _build(
             posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
         if replaced:
             log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
-    models = []
+    models, pairs = [], _pair_rotations(graph)
     for component, reconstruction in enumerate(posed):
         others = frozenset(solution.image_ids[~np.isin(solution.component, (-1, component))].tolist())
-        result = build_model(cache, reconstruction, options, log, others)
+        result = build_model(cache, reconstruction, options, log, others, pairs)
         if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() > 0:
             models.append(_Model(reconstruction, component, result))
         elif len(posed) > 1:
@@ -192,6 +193,13 @@ def _build(
                 for m in models
             ]
     return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
+
+
+def _pair_rotations(graph: ViewGraph) -> PairRotations:
+    """Of pairs whose matches have a pose of their own, whatever the solver thought of it."""
+    posed = graph.has_direction
+    matches = np.ones(graph.num_edges) if graph.num_inliers is None else graph.num_inliers.astype(np.float64)
+    return PairRotations(graph.image_ids[graph.edges[posed]], graph.cam2_from_cam1_rotations[posed], matches[posed])
 
 
 def _read(database_path: str | PathLike[str], options: MappingOptions, log: StageLog) -> ViewGraph:
@@ -240,6 +248,8 @@ def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Mo
     """The solution with the poses, focal lengths and image verdicts of the finished models."""
     words = solution.image_verdicts.astype(object)
     words[solution.component >= 0] = ImageVerdict.FEW_OBSERVATIONS
+    misplaced = sorted(set().union(*(model.result.misplaced for model in models)))
+    words[np.isin(solution.image_ids, misplaced)] = ImageVerdict.MISPLACED
     component = np.full(len(words), -1)
     rotations = np.full_like(solution.cam_from_world_rotations, np.nan)
     centers = np.full_like(solution.projection_centers, np.nan)

@@ -58,6 +58,7 @@ class ImageVerdict(Verdict):
     CUT_OFF = "cut_off", "all edges that linked it to the solved images were outliers"
     NOT_RIGID = "not_rigid", "its edges do not fix its position relative to the others (for instance a single edge)"
     UNCERTAIN = "uncertain", "its pairs fix its position to worse than a tenth of the scene's radius"
+    MISPLACED = "misplaced", "points would place it where its pairs' relative poses contradict that"
     FEW_OBSERVATIONS = (
         "few_observations",
         "too few triangulated points that three images see at an angle are seen in it",

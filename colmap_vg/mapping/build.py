@@ -18,6 +18,7 @@ from colmap_vg.mapping.options import (
     mapper_options,
     triangulator_options,
 )
+from colmap_vg.mapping.pair_agreement import PairRotations, pair_agreement
 from colmap_vg.mapping.support import supported_observations
 from colmap_vg.options import MappingOptions
 from colmap_vg.stages import StageLog
@@ -43,10 +44,13 @@ class BuildResult:
         Ids of images that were registered against the triangulated points.
     removed : frozenset of int
         Ids of images that left because too few points fix them.
+    misplaced : frozenset of int
+        Ids of images that points would have placed where their pairs contradict it.
     """
 
     added: frozenset[int]
     removed: frozenset[int]
+    misplaced: frozenset[int] = frozenset()
 
 
 def build_model(
@@ -55,6 +59,7 @@ def build_model(
     options: MappingOptions,
     log: StageLog,
     others: frozenset[int] = frozenset(),
+    pairs: PairRotations | None = None,
 ) -> BuildResult:
     """Triangulate and adjust a reconstruction of poses, in place, and register what is left.
 
@@ -67,6 +72,9 @@ def build_model(
     log : StageLog
     others : frozenset of int
         Ids of images that have a model of their own; they are not registered in this one.
+    pairs : PairRotations, optional
+        Images that come by their points leave again where their pairs contradict that; parts of the finished model
+        that no pair confirms are a warning.
 
     Returns
     -------
@@ -99,15 +107,18 @@ def build_model(
         # What left may come back by the points: the graph had it in a wrong place.
         added = _register_left_out(mapper, options, others)
         removed -= added
-        if added or removed:
+        misplaced = _remove_misplaced(mapper, added, pairs)
+        added -= misplaced
+        if added or removed or misplaced:
             mapper.complete_and_merge_tracks(triangulator)
             _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-4)
             again = _remove_unsupported(mapper)
             removed, added = removed | again, added - again
         log.result(f"{len(added)} images added, {len(removed)} removed")
+        _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
-    return BuildResult(frozenset(added), frozenset(removed))
+    return BuildResult(frozenset(added), frozenset(removed), frozenset(misplaced))
 
 
 def adjust_once_more(
@@ -194,6 +205,31 @@ def _register_left_out(
                 break
         else:
             return added
+
+
+def _remove_misplaced(mapper: "pycolmap.IncrementalMapper", added: set[int], pairs: PairRotations | None) -> set[int]:
+    """Deregister those of the images that came by their points whose pairs tell another rotation."""
+    if pairs is None or not added:
+        return set()
+    misplaced = added & pair_agreement(mapper.reconstruction, pairs).contradicted
+    for image_id in sorted(misplaced):
+        mapper.observation_manager.deregister_frame(mapper.reconstruction.image(image_id).frame_id)
+    return misplaced
+
+
+def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotations | None, log: StageLog) -> None:
+    if pairs is None:
+        return
+    found = pair_agreement(reconstruction, pairs)
+    for part in found.detached:
+        names = sorted(reconstruction.image(i).name for i in part)
+        log.warn(
+            f"{len(names)} images ({names[0]} to {names[-1]}) are held to the rest of the model by points alone: all"
+            " pairs between them tell other rotations. The model may be folded there."
+        )
+    if found.contradicted:
+        names = sorted(reconstruction.image(i).name for i in found.contradicted)
+        log.warn(f"The pairs of {len(names)} images tell other rotations than the model (first: {names[0]}).")
 
 
 def _state(reconstruction: "pycolmap.Reconstruction") -> str:

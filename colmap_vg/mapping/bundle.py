@@ -13,7 +13,7 @@ from colmap_vg.mapping.point_refinement import refine_points
 from colmap_vg.options import MappingOptions
 from colmap_vg.robust import EFFICIENT_CAUCHY
 
-RAYLEIGH_MEAN, MIN_SIGMA_PX = 1.2533, 0.1
+RAYLEIGH_MEAN, MIN_SIGMA_PX, MAX_SCALE_PX = 1.2533, 0.1, 1.0
 """Mean length of two normal deviates of deviation 1; keypoints are no better than a tenth of a pixel."""
 
 
@@ -60,13 +60,13 @@ def adjust_bundle(
 def _loss_scale(reconstruction: "pycolmap.Reconstruction") -> float:
     """Cauchy scale for the noise that the keypoints show, pixels.
 
-    A pixel is a lot for sharp photographs and not much for blurred ones: half of it lowered the errors of the former by
-    up to a fifth, and raised those of the latter by a tenth.
+    A pixel is a lot for sharp photographs: half of it lowered their cameras' errors by up to a fifth. More than a pixel
+    is no noise of keypoints but that of a poor start.
     """
     reconstruction.update_point_3d_errors()
     errors = np.array([point.error for point in reconstruction.points3D.values()])
     sigma = float(np.median(errors)) / RAYLEIGH_MEAN if len(errors) else 0.0
-    return EFFICIENT_CAUCHY * max(sigma, MIN_SIGMA_PX)
+    return min(EFFICIENT_CAUCHY * max(sigma, MIN_SIGMA_PX), MAX_SCALE_PX)
 
 
 def _move_short_tracks(reconstruction: "pycolmap.Reconstruction", scale_px: float) -> None:

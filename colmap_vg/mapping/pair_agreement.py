@@ -1,0 +1,88 @@
+"""A finished model against the relative poses of its pairs: images that points alone hold, and parts that fold.
+
+Points can tie an image to a look-alike of what it shows; its pairs' two-view geometries then tell another rotation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from colmap_vg.rotations.robust import rotation_residuals
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+MAX_ROTATION_DEG = 15.0
+"""Of a pair against the model; the noise of weak true pairs was seen to reach ten."""
+MIN_PART_IMAGES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class PairRotations:
+    """Relative rotations of pairs with a pose of their own.
+
+    Attributes
+    ----------
+    image_ids : (m, 2) int64 array
+    cam2_from_cam1_rotations : (m, 3, 3) array
+    num_matches : (m,) array
+    """
+
+    image_ids: IntArray
+    cam2_from_cam1_rotations: Array
+    num_matches: Array
+
+
+@dataclass(frozen=True)
+class PairAgreement:
+    """What the pairs say of a model.
+
+    Attributes
+    ----------
+    contradicted : frozenset of int
+        Ids of images whose pairs, by more than half of their matches, tell another rotation.
+    detached : tuple of frozenset of int
+        Parts of three images or more that no agreeing pair links to the largest part.
+    """
+
+    contradicted: frozenset[int]
+    detached: tuple[frozenset[int], ...]
+
+
+def pair_agreement(reconstruction: "pycolmap.Reconstruction", pairs: PairRotations) -> PairAgreement:
+    """Compare a model's rotations with those of its pairs.
+
+    Parameters
+    ----------
+    reconstruction : pycolmap.Reconstruction
+    pairs : PairRotations
+        Pairs with an image outside the model do not count.
+    """
+    ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
+    inside = np.isin(pairs.image_ids, ids).all(axis=1)
+    edges = np.searchsorted(ids, pairs.image_ids[inside])
+    if len(edges) == 0:
+        return PairAgreement(frozenset(), ())
+    rotations = np.array([reconstruction.image(i).cam_from_world().rotation.matrix() for i in ids.tolist()])
+    residuals = rotation_residuals(edges, pairs.cam2_from_cam1_rotations[inside], rotations)
+    agree = residuals <= np.radians(MAX_ROTATION_DEG)
+    matches = np.asarray(pairs.num_matches[inside], dtype=np.float64)
+    whole, good = (
+        np.bincount(edges.ravel(), weights=np.repeat(w, 2), minlength=len(ids)) for w in (matches, matches * agree)
+    )
+    contradicted = frozenset(ids[good < 0.5 * whole].tolist())
+    return PairAgreement(contradicted, _detached(ids, edges[agree], np.unique(edges)))
+
+
+def _detached(ids: IntArray, edges: IntArray, with_pairs: IntArray) -> tuple[frozenset[int], ...]:
+    """Parts besides the largest of the graph of agreeing pairs; images without any pair are none."""
+    graph = sp.coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(ids), len(ids)))
+    part = connected_components(graph, directed=False)[1][with_pairs]
+    sizes = np.bincount(part)
+    order = np.argsort(-sizes, kind="stable")[1:]
+    return tuple(frozenset(ids[with_pairs[part == k]].tolist()) for k in order.tolist() if sizes[k] >= MIN_PART_IMAGES)
