@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
-from colmap_vg.colmap_io.cameras import bearings_of_keypoints
+from colmap_vg.geometry.directions import normalized
 from colmap_vg.mapping.options import MIN_TRACK_LENGTH, bundle_options
 from colmap_vg.mapping.point_refinement import refine_points
 from colmap_vg.options import MappingOptions
@@ -83,7 +83,8 @@ def _move_short_tracks(reconstruction: "pycolmap.Reconstruction", scale_px: floa
     rays, focal = np.zeros((len(elements), 3)), np.zeros(len(elements))
     for camera_id in np.unique(camera_ids).tolist():
         camera, own = reconstruction.camera(camera_id), camera_ids == camera_id
-        rays[own] = bearings_of_keypoints(camera, keypoints[own])[0]
+        # Keypoints without a ray are NaN, and leave their points where they are.
+        rays[own] = normalized(np.concatenate([camera.cam_from_img(keypoints[own]), np.ones((own.sum(), 1))], axis=1))
         focal[own] = camera.mean_focal_length()
     world_from_cam = np.array([image.cam_from_world().rotation.matrix().T for image in images])
     centers = np.array([image.projection_center() for image in images])
