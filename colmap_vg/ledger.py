@@ -42,6 +42,7 @@ class Ledger:
         self._R, self._p = np.full((graph.num_images, 3, 3), np.nan), np.full((graph.num_images, 3), np.nan)
         self._component = np.full(graph.num_images, -1, dtype=np.int64)
         self._focal_scales = np.ones(num_cameras(graph))
+        self._radial_terms = np.zeros(num_cameras(graph))
         self._seen_cameras = np.zeros(num_cameras(graph), dtype=bool)
         self._converged = True
         self._covariances: Array | None = None
@@ -109,6 +110,7 @@ class Ledger:
         focal_scales: Array,
         converged: bool,
         covariances: tuple[Array, Array] | None = None,
+        radial_terms: Array | None = None,
     ) -> None:
         """Take down the poses of a part as a component of its own; centroid 0, root mean square distance 1.
 
@@ -131,6 +133,8 @@ class Ledger:
             cameras[self.graph.camera_idx[part.images]] = True
             own = cameras & ~self._seen_cameras
             self._focal_scales[own] = focal_scales[own]
+            if radial_terms is not None:
+                self._radial_terms[own] = radial_terms[own]
             self._seen_cameras |= cameras
 
     def solution(self) -> PoseSolution:
@@ -158,6 +162,7 @@ class Ledger:
             registered=component == 0,
             component=component,
             focal_scales=self._focal_scales,
+            radial_terms=self._radial_terms if self._radial_terms.any() else None,
             edge_kept=self.usable & inside,
             edge_verdicts=self.edge_verdicts.astype(str),
             image_verdicts=self.image_verdicts.astype(str),

@@ -49,6 +49,9 @@ class PoseSolution:
         Component each image belongs to, numbered by size; -1 where unsolved.
     focal_scales : (c,) array
         Factor on each camera's focal length in the graph.
+    radial_terms : (c,) array or None
+        Radial term found for each camera, as in COLMAP's polynomials and at the focal length found, on top of what
+        the camera had. None where none was worth having.
     position_covariances : (n, 3, 3) array or None
         Of the centres, in their component's frame and unit after the best similarity; where asked for.
     rotation_covariances : (n, 3, 3) array or None
@@ -81,6 +84,7 @@ class PoseSolution:
     status: SolutionStatus
     message: str
     caveats: tuple[str, ...] = ()
+    radial_terms: Array | None = None
     position_covariances: Array | None = None
     rotation_covariances: Array | None = None
     edge_residual_sigmas: Array | None = None

@@ -16,6 +16,7 @@ from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
 from colmap_vg.epipolar.baseline_lengths import connects_all, length_links, positions_by_lengths, solve_lengths
 from colmap_vg.epipolar.covariance import camera_covariances
 from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
+from colmap_vg.epipolar.radial_term import fit_radial_term
 from colmap_vg.errors import GraphError
 from colmap_vg.graph.one_dsfm import one_dsfm_broken_weights
 from colmap_vg.graph.subgraph import Subgraph
@@ -110,7 +111,15 @@ def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> P
             ledger.leave_out(gated, ImageVerdict.NOT_RIGID)
             unsolved[gated.images] = False
             continue
-        ledger.place(rigid, poses.rotations, poses.centers, poses.focal_scales, poses.converged, poses.covariances)
+        ledger.place(
+            rigid,
+            poses.rotations,
+            poses.centers,
+            poses.focal_scales,
+            poses.converged,
+            poses.covariances,
+            poses.radial_terms,
+        )
         unsolved[rigid.images] = False
 
 
@@ -123,6 +132,7 @@ class _Poses:
     focal_scales: Array
     converged: bool = True
     covariances: tuple[Array, Array] | None = None
+    radial_terms: Array | None = None
 
 
 def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) -> tuple[Array, Subgraph]:
@@ -330,8 +340,10 @@ def _adjust_epipolar(
     directions = ledger.graph.cam2_in_cam1_directions[part.edge_rows]
     found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     ledger.log.extend(found.log)
+    problem, found, radial_terms = _with_radial_term(ledger, problem, found, directions)
     ledger.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
-    dropped = found.reversed_edges | _contradicting(ledger, part, found)
+    # Relative poses of bent rays contradict straight ones, right as both may be.
+    dropped = found.reversed_edges | (_contradicting(ledger, part, found) & (radial_terms is None))
     if dropped.sum() > found.reversed_edges.sum():
         ledger.drop(part.edge_rows[dropped & ~found.reversed_edges], EdgeVerdict.CONTRADICTS_POSES)
         rest = replace(problem.without(dropped), free_focals=problem.free_focals & ~found.lost_focals)
@@ -361,11 +373,38 @@ def _adjust_epipolar(
         found.projection_centers[rows],
         found.focal_scales[group],
         found.converged,
+        radial_terms=radial_terms,
     )
     if options.covariances:
         known = camera_covariances(problem, found, seed=options.random_seed)
         solved = replace(solved, covariances=(known.positions[rows], known.rotations[rows]))
     return fixed, solved
+
+
+def _with_radial_term(
+    ledger: Ledger, problem: EpipolarProblem, found: AdjustmentResult, directions: Array
+) -> tuple[EpipolarProblem, AdjustmentResult, Array | None]:
+    """The problem, its cameras and the radial terms (c,) after one was found, where lenses are free and ask for it."""
+    graph, (group, first) = ledger.graph, focal_groups(ledger.graph)
+    free = problem.free_focals & ~found.lost_focals
+    if graph.camera_radial is None or not free.any():
+        return problem, found, None
+    bendable = free & (np.bincount(group, weights=~graph.camera_radial, minlength=len(first)) == 0)
+    lens = fit_radial_term(problem, found, bendable) if bendable.any() else None
+    if lens is None:
+        return problem, found, None
+    start = lens.result
+    again = adjust_epipolar(
+        lens.problem,
+        start.cam_from_world_rotations,
+        start.projection_centers,
+        directions,
+        initial_focal_scales=start.focal_scales,
+        scales_px=(start.scale_px,),
+    )
+    ledger.log.extend(again.log)
+    terms = np.where(bendable, lens.radial_term * np.square(again.focal_scales), 0.0)[group]
+    return lens.problem, again, np.asarray(terms)
 
 
 def _contradicting(ledger: Ledger, part: Subgraph, found: AdjustmentResult) -> BoolArray:

@@ -54,6 +54,8 @@ class ViewGraph:
         Mean focal length in pixels under which bearings and relative poses were taken.
     camera_focal_known : (c,) bool array or None
         Whether that focal length was given (calibrated, or from EXIF and not contradicted), not found by us.
+    camera_radial : (c,) bool array or None
+        Whether the camera's model has a radial term that may be found with its focal length.
     read_verdicts : (m,) str array or None
         `EdgeVerdict` words given on reading; edges other than ``kept`` and ``rotation_only`` are not solved with.
     trusted : (m,) bool array or None
@@ -83,6 +85,7 @@ class ViewGraph:
     camera_ids: IntArray | None = field(default=None, kw_only=True)
     camera_focal_lengths: Array | None = field(default=None, kw_only=True)
     camera_focal_known: BoolArray | None = field(default=None, kw_only=True)
+    camera_radial: BoolArray | None = field(default=None, kw_only=True)
     read_verdicts: NDArray[np.str_] | None = field(default=None, kw_only=True)
     trusted: BoolArray | None = field(default=None, kw_only=True)
     planar: BoolArray | None = field(default=None, kw_only=True)
@@ -151,6 +154,7 @@ class ViewGraph:
             "camera_ids": (c,),
             "camera_focal_lengths": (c,),
             "camera_focal_known": (c,),
+            "camera_radial": (c,),
             "read_verdicts": (m,),
             "trusted": (m,),
             "planar": (m,),
@@ -233,6 +237,7 @@ _KINDS: dict[str, type] = {
     "camera_ids": np.int64,
     "camera_focal_lengths": np.float64,
     "camera_focal_known": np.bool_,
+    "camera_radial": np.bool_,
     "read_verdicts": np.str_,
     "trusted": np.bool_,
     "planar": np.bool_,

@@ -66,6 +66,30 @@ def with_focal_scale(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camer
     return copy
 
 
+def has_radial_term(camera: "pycolmap.Camera") -> bool:
+    """Whether the camera's model distorts by a polynomial of the normalised radius."""
+    return camera.model_name in _DISTORTED_BY_POLYNOMIAL
+
+
+def with_radial_term(camera: "pycolmap.Camera", term: float) -> "pycolmap.Camera":
+    """Copy of a camera with a radial term more: exact where it had none, to first order elsewhere.
+
+    Parameters
+    ----------
+    camera : pycolmap.Camera
+        With a radial term, see :func:`has_radial_term`.
+    term : float
+        Of COLMAP's polynomial in normalised coordinates.
+    """
+    copy = pycolmap.Camera(camera.todict())
+    params = np.array(copy.params, dtype=float)
+    params[_RADIAL_POWERS[copy.model_name][0][0]] += term
+    copy.params = params.tolist()
+    return copy
+
+
+_DISTORTED_BY_POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
 _RADIAL_POWERS: dict[str, tuple[tuple[int, int], ...]] = {
     "SIMPLE_RADIAL": ((3, 2),),
     "RADIAL": ((3, 2), (4, 4)),

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.cameras import bearings_of_keypoints, with_focal_scale
+from colmap_vg.colmap_io.cameras import bearings_of_keypoints, has_radial_term, with_focal_scale
 from colmap_vg.colmap_io.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.relative_poses import relative_poses
@@ -79,6 +79,7 @@ def _graph(tables: DatabaseTables, focals: FocalDecision, options: ReadOptions) 
         camera_ids=np.array([c.camera_id for c in cameras], dtype=np.int64),
         camera_focal_lengths=np.array([c.mean_focal_length() for c in cameras]),
         camera_focal_known=focals.known,
+        camera_radial=np.array([has_radial_term(c) for c in cameras], dtype=bool),
         read_verdicts=verdicts,
         trusted=trusted if trusted.any() else None,
         planar=geometry.planar,

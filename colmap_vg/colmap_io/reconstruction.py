@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_vg.colmap_io.cameras import with_focal_scale
+from colmap_vg.colmap_io.cameras import with_focal_scale, with_radial_term
 from colmap_vg.colmap_io.database import working_copy
 from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.shared_cameras import merge_cameras
@@ -98,8 +98,9 @@ def reconstruction_from_solution(
     """
     reconstruction = loaded_reconstruction(cache)
     if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
-        for camera_id, focal, scale in zip(
-            graph.camera_ids.tolist(), graph.camera_focal_lengths, solution.focal_scales, strict=True
+        terms = np.zeros(len(graph.camera_ids)) if solution.radial_terms is None else solution.radial_terms
+        for camera_id, focal, scale, term in zip(
+            graph.camera_ids.tolist(), graph.camera_focal_lengths, solution.focal_scales, terms.tolist(), strict=True
         ):
             if reconstruction.exists_camera(camera_id):
                 camera = reconstruction.camera(camera_id)
@@ -107,6 +108,8 @@ def reconstruction_from_solution(
                 # Not touched where nothing changed, so that given calibrations stay as they are to the last bit.
                 if abs(factor - 1.0) > 1e-12:
                     camera.params = with_focal_scale(camera, factor).params.tolist()
+                if term != 0.0:
+                    camera.params = with_radial_term(camera, term).params.tolist()
     for row in np.flatnonzero(solution.component == component):
         R, center = solution.cam_from_world_rotations[row], solution.projection_centers[row]
         image = reconstruction.image(int(solution.image_ids[row]))

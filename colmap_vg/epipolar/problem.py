@@ -9,16 +9,22 @@ from numpy.typing import NDArray
 from colmap_vg.epipolar.depth_agreement import TripletRays
 from colmap_vg.epipolar.sampson import Matches, cut_rays
 from colmap_vg.epipolar.triplets import Triplets, find_triplets
+from colmap_vg.geometry.directions import normalized
 from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.options import SolveOptions
 from colmap_vg.two_view.pieces import Pieces
-from colmap_vg.two_view.segments import rows_of_segments, segment_subset
+from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows, segment_subset
 from colmap_vg.two_view.spread import well_spread
 from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+
+MIN_AXIAL = 0.3
+"""Cosine to the axis of rays that a radial term is taken out of."""
+NEWTON_STEPS, MIN_SLOPE = 8, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +86,48 @@ class EpipolarProblem:
             keypoints2=None if self.keypoints2 is None else self.keypoints2[rows],
         )
 
+    def straightened(self, radial_term: float, cameras: BoolArray) -> "EpipolarProblem":
+        """The same after a radial term, as COLMAP has it, was taken out of the rays of some cameras (c,)."""
+        terms = np.where(cameras, radial_term, 0.0)[self.camera_idx]
+        image = self.edges[segment_of_rows(self.offsets)]
+        triplets = self.triplets
+        if triplets is not None:
+            seen_by = triplets.images[segment_of_rows(triplets.offsets)].T
+            bearings = [
+                _straightened(rays.T, terms[images]).T for rays, images in zip(triplets.bearings, seen_by, strict=True)
+            ]
+            triplets = replace(triplets, bearings=np.stack(bearings))
+        return replace(
+            self,
+            bearings1=_straightened(self.bearings1, terms[image[:, 0]]),
+            bearings2=_straightened(self.bearings2, terms[image[:, 1]]),
+            triplets=triplets,
+        )
+
     def triplet_rays(self, triplets: Triplets, log_scales: Array) -> TripletRays:
         """Rays and pixel variances of triplets at logarithms (c,) of factors on the focal lengths."""
         camera = self.camera_idx[triplets.images].T
         focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
         shrinks = np.exp(-log_scales[camera]) if self.free_focals.any() else None
         return TripletRays(triplets.pieces, focal**-2.0, shrinks)
+
+
+def _straightened(rays: Array, radial_terms: Array) -> Array:
+    """Unit rays (k, 3) of points whose normalised coordinates ``u (1 + k |u|^2)`` the given ones show.
+
+    Rays far off the axis, which no polynomial reaches, stay as they are.
+    """
+    z = rays[:, 2]
+    near = z > MIN_AXIAL
+    shown = np.where(near, np.hypot(rays[:, 0], rays[:, 1]) / np.where(near, z, 1.0), 0.0)
+    radius = shown.copy()
+    # Where the term is negative the polynomial has a maximum, and nothing beyond it is shown.
+    limit = np.where(radial_terms < 0.0, np.sqrt(1.0 / np.maximum(-3.0 * radial_terms, 1e-12)), np.inf)
+    for _ in range(NEWTON_STEPS):
+        slope = np.maximum(1.0 + 3.0 * radial_terms * radius**2, MIN_SLOPE)
+        radius = np.clip(radius - (radius * (1.0 + radial_terms * radius**2) - shown) / slope, 0.0, limit)
+    factor = np.where(shown > 0.0, radius / np.where(shown > 0.0, shown, 1.0), 1.0)
+    return normalized(np.concatenate([rays[:, :2] * factor[:, None], z[:, None]], axis=1))
 
 
 def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) -> EpipolarProblem | None:

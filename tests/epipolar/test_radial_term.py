@@ -1,0 +1,83 @@
+"""A radial term: taken out of rays exactly, found where it is and only there, and carried to the camera."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from epipolar.image_sets import FOCAL, image_set
+
+from colmap_vg import align_positions
+from colmap_vg.colmap_io.cameras import has_radial_term, with_radial_term
+from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar
+from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.radial_term import fit_radial_term
+from colmap_vg.geometry.directions import normalized
+
+ALL = np.array([True])
+
+
+def shown(rays: np.ndarray, term: float) -> np.ndarray:
+    """Rays as a lens with a radial term shows them."""
+    u = rays[:, :2] / rays[:, 2:]
+    bent = u * (1.0 + term * np.sum(u**2, axis=1, keepdims=True))
+    return normalized(np.concatenate([bent, np.ones((len(u), 1))], axis=1))
+
+
+def bent(problem: EpipolarProblem, term: float) -> EpipolarProblem:
+    triplets = problem.triplets
+    bearings = np.stack([shown(rays.T, term).T for rays in triplets.bearings])
+    return replace(
+        problem,
+        bearings1=shown(problem.bearings1, term),
+        bearings2=shown(problem.bearings2, term),
+        triplets=replace(triplets, bearings=bearings),
+    )
+
+
+@pytest.mark.parametrize("term", [-0.2, 0.15])
+def test_a_term_is_taken_out_exactly(term: float) -> None:
+    problem, _, _ = image_set(0, "ring", 8, 300, 0.5)
+    straight = bent(problem, term).straightened(term, ALL)
+    np.testing.assert_allclose(straight.bearings1, problem.bearings1, atol=1e-9)
+    np.testing.assert_allclose(straight.triplets.bearings, problem.triplets.bearings, atol=1e-9)
+    same = problem.straightened(term, ~ALL)
+    np.testing.assert_allclose(same.bearings2, problem.bearings2, atol=1e-15)
+
+
+def test_rays_off_the_axis_and_beyond_a_maximum_stay_finite() -> None:
+    problem, _, _ = image_set(0, "ring", 4, 100, 0.5)
+    wide = problem.bearings1.copy()
+    wide[:3] = normalized(np.array([[1.0, 0.0, -0.2], [2.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
+    straight = replace(problem, bearings1=wide).straightened(-0.5, ALL).bearings1
+    assert np.isfinite(straight).all()
+    np.testing.assert_allclose(straight[[0, 2]], wide[[0, 2]])
+
+
+def test_the_term_of_a_bent_lens_is_found_with_its_focal_length_and_positions() -> None:
+    problem, R, p = image_set(2, "street", 16, 2500, 0.3, free=True)
+    curved = bent(problem, -0.1)
+    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
+    without = adjust_epipolar(curved, R, p, directions)
+    found = fit_radial_term(curved, without, ALL)
+    assert found is not None
+    assert abs(found.radial_term + 0.1) < 0.01
+    assert abs(np.log(found.result.focal_scales[0])) < 0.01
+    error, before = (align_positions(r.projection_centers, p)[0].mean() for r in (found.result, without))
+    assert error < 0.1 * before
+
+
+def test_a_straight_lens_gets_none() -> None:
+    problem, R, p = image_set(3, "ring", 12, 600, 0.5, free=True)
+    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
+    assert fit_radial_term(problem, adjust_epipolar(problem, R, p, directions), ALL) is None
+
+
+def test_the_camera_shows_what_the_term_says() -> None:
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=[FOCAL, 500.0, 400.0, 0.0])
+    assert has_radial_term(camera)
+    assert not has_radial_term(pycolmap.Camera(model="PINHOLE", width=10, height=8, params=[9.0, 9.0, 5.0, 4.0]))
+    rays = normalized(np.array([[0.1, 0.2, 1.0], [-0.3, 0.1, 1.0]]))
+    expected = shown(rays, -0.07)
+    pixels = with_radial_term(camera, -0.07).img_from_cam(rays)
+    np.testing.assert_allclose(pixels, FOCAL * expected[:, :2] / expected[:, 2:] + [500.0, 400.0], atol=1e-6)
