@@ -19,7 +19,8 @@ BoolArray = NDArray[np.bool_]
 
 MAX_ROTATION_DEG = 15.0
 """Of a pair against the model; the noise of weak true pairs was seen to reach ten."""
-MIN_PART_IMAGES = 3
+MIN_CONTRADICTING, MIN_PART_IMAGES = 3, 3
+"""Pairs that contradict an image, for one or two weak ones are often wrong themselves; images of a part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class PairAgreement:
     Attributes
     ----------
     contradicted : frozenset of int
-        Ids of images whose pairs, by more than half of their matches, tell another rotation.
+        Ids of images of which three pairs or more, by more than half of the matches, tell another rotation.
     detached : tuple of frozenset of int
         Parts of three images or more that no agreeing pair links to the largest part.
     """
@@ -75,7 +76,8 @@ def pair_agreement(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
     whole, good = (
         np.bincount(edges.ravel(), weights=np.repeat(w, 2), minlength=len(ids)) for w in (matches, matches * agree)
     )
-    contradicted = frozenset(ids[good < 0.5 * whole].tolist())
+    number = np.bincount(edges[~agree].ravel(), minlength=len(ids))
+    contradicted = frozenset(ids[(good < 0.5 * whole) & (number >= MIN_CONTRADICTING)].tolist())
     return PairAgreement(contradicted, _detached(ids, edges[agree], np.unique(edges)))
 
 
