@@ -82,7 +82,7 @@ class FeatureOptions(_Checked):
     camera_model: str = "SIMPLE_RADIAL"
     camera_params: tuple[float, ...] = ()  # in the model's order, pixels; empty: from EXIF, else guessed
     camera_mode: CameraMode = "auto"  # auto: COLMAP's, which shares a camera only where EXIF says so
-    matching: Matching = "auto"  # exhaustive, in folders of more than 60 images selected: by their largest features
+    matching: Matching = "auto"  # exhaustive, in folders of more than 20 images selected: by their largest features
     image_list_path: str | PathLike[str] | None = None  # file with one image name a line; None: all of the folder
     mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png for image NAME; black hides features
     max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are shrunk for extraction; -1: COLMAP's
@@ -91,14 +91,27 @@ class FeatureOptions(_Checked):
     num_threads: int = _number(-1, -1)  # -1: all cores
     random_seed: int = _number(0, 0)
 
+    @classmethod
+    def of_quality(cls, quality: Quality, **options: Any) -> "FeatureOptions":
+        """The options of a preset, save for those that are given.
 
-QUALITIES: dict[Quality, tuple[int, int]] = {
-    "low": (1000, 2048),
-    "medium": (1600, 4096),
-    "high": (-1, 8192),
-    "extreme": (100_000, 16384),
+        Raises
+        ------
+        OptionError
+            There is no such preset, or an option is outside its range.
+        """
+        if quality not in QUALITIES:
+            raise OptionError(f"quality is {quality!r}; choose one of {', '.join(QUALITIES)}")
+        return cls(**{**QUALITIES[quality], **options})
+
+
+QUALITIES: dict[Quality, dict[str, Any]] = {
+    "low": {"max_image_size": 1000, "max_num_features": 2048},
+    "medium": {"max_image_size": 1600, "max_num_features": 4096},
+    "high": {},
+    "extreme": {"max_image_size": 100_000, "max_num_features": 16384, "matching": "exhaustive"},
 }
-"""Longer side of the images in pixels, as `FeatureOptions.max_image_size`, and features per image."""
+"""Fields of `FeatureOptions` for each preset; the others keep their defaults."""
 
 
 @dataclass(frozen=True)

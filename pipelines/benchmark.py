@@ -2,7 +2,8 @@
 
 ``mapping``: ours, global and incremental mapping in turn on databases (folders with database.db and, when known,
 ground_truth.txt). ``graphs``: the default solve without matches beside rotation averaging alone, on the topologies of
-1DSfM. ``growth``: synthetic databases and graphs of rising size, with fitted exponents. Writes Markdown, JSON and SVG.
+1DSfM. ``growth``: synthetic databases and graphs of rising size, with fitted exponents. ``photographs``: from folders
+of photographs to models, ours and COLMAP's default way in turn. Writes Markdown, JSON and SVG.
 Times differ from machine to machine and from hour to hour: compare ratios, and exponents.
 """
 
@@ -15,15 +16,18 @@ import sys
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 import colmap_vg
 from colmap_vg.colmap_io.synthetic_database import write_synthetic_database
+from colmap_vg.demo.photographs import render_photographs
+from colmap_vg.options import Quality
 from colmap_vg.report.growth import Timing, growth_table, looped_scene, timed_rotation_averaging, timed_solve
 from colmap_vg.report.mapper_runs import MAPPERS, MapperRun, alternate, compared
 from colmap_vg.report.markdown import markdown_table
+from colmap_vg.report.photograph_runs import WAYS, PhotographRun, alternate_ways, compared_ways
 from colmap_vg.report.scenes import set_conditions, simulated_scene, topology_sets
 from colmap_vg.report.svg import growth_svg
 from colmap_vg.synthetic_views import SyntheticViews, synthetic_views
@@ -37,15 +41,17 @@ QUICK_LIMIT = 1.5
 def main() -> None:
     """Run the pipeline."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["mapping", "graphs", "growth"])
+    parser.add_argument("what", choices=["mapping", "graphs", "growth", "photographs"])
     parser.add_argument("--output_path", type=Path, required=True, help="receives report.md, report.json and plots")
     parser.add_argument("--databases", type=Path, nargs="+", help="folders with database.db; default: synthetic ones")
+    parser.add_argument("--photographs", type=Path, nargs="+", help="folders with images/; default: rendered ones")
+    parser.add_argument("--quality", choices=get_args(Quality), default="high", help="of features, for photographs")
     parser.add_argument("--mappers", nargs="+", choices=MAPPERS, default=list(MAPPERS))
     parser.add_argument("--runs", type=int, default=3, help="of each mapper on each database")
     parser.add_argument("--topology", type=Path, help="folder of .mat adjacencies, for graphs")
     parser.add_argument("--sets", nargs="+", help="of the topology; default: all")
     parser.add_argument("--layouts", nargs="+", choices=["street", "ring", "drone"], default=["street", "drone"])
-    parser.add_argument("--sizes", type=int, nargs="+", help="images of synthetic databases")
+    parser.add_argument("--sizes", type=int, nargs="+", help="images of synthetic databases, or to render")
     parser.add_argument("--edges", type=int, nargs="*", help="edges of synthetic graphs, for growth")
     parser.add_argument("--quick", action="store_true", help="small problems; fails by ratios only")
     arguments = parser.parse_args()
@@ -54,7 +60,7 @@ def main() -> None:
     if arguments.what == "graphs" and arguments.topology is None:
         parser.error("graphs needs --topology")
     arguments.output_path.mkdir(parents=True, exist_ok=True)
-    job = {"mapping": mapping, "graphs": graphs, "growth": growth}[arguments.what]
+    job = {"mapping": mapping, "graphs": graphs, "growth": growth, "photographs": photographs}[arguments.what]
     try:
         text, data, plots, failed = job(arguments)
     except colmap_vg.ColmapVgError as error:
@@ -147,6 +153,38 @@ def growth(arguments: argparse.Namespace) -> Result:
     return text, {name: [asdict(t) for t in own] for name, own in series.items()}, plots, []
 
 
+def photographs(arguments: argparse.Namespace) -> Result:
+    """Both ways from photographs to a model in turn."""
+    with tempfile.TemporaryDirectory() as name:
+        folders = arguments.photographs
+        if not folders:
+            sizes = arguments.sizes or ([12] if arguments.quick else [100])
+            folders = [rendered_folder(Path(name), size) for size in sizes]
+        text, data, failed = "", {}, []
+        for folder in folders:
+            truth = folder / "ground_truth.txt"
+            runs = alternate_ways(
+                folder / "images", truth if truth.is_file() else None, arguments.runs, arguments.quality, show_way
+            )
+            text += f"## {folder.name}\n\n{compared_ways(runs)}\n"
+            data[folder.name] = [asdict(run) for run in runs]
+            ours, theirs = ([run for run in runs if run.way == way] for way in WAYS)
+            if arguments.quick and min(r.num_registered for r in ours) < min(r.num_registered for r in theirs):
+                failed.append(f"{folder.name}: fewer images than COLMAP's way")
+    return text, data, {}, failed
+
+
+def rendered_folder(parent: Path, size: int) -> Path:
+    """A folder with rendered images and ground_truth.txt."""
+    folder = parent / f"rendered-{size}"
+    (folder / "images").mkdir(parents=True)
+    cameras = render_photographs(folder / "images", num_images=size)
+    numbers = np.concatenate([cameras.rotations.reshape(-1, 9), cameras.centers], axis=1).tolist()
+    rows = zip(cameras.names, numbers, strict=True)
+    (folder / "ground_truth.txt").write_text("".join(f"{n} {' '.join(map(repr, row))}\n" for n, row in rows))
+    return folder
+
+
 def plotted(title: str, label: str, series: dict[str, list[Timing]]) -> str:
     """Growth as SVG."""
     return growth_svg(
@@ -176,6 +214,11 @@ def truth_text(views: SyntheticViews) -> str:
 def show(run: MapperRun) -> None:
     """A line for each finished run."""
     print(f"{run.mapper}: {run.seconds:.1f} s, {run.num_registered}/{run.num_images} images", flush=True)
+
+
+def show_way(run: PhotographRun) -> None:
+    """A line for each finished way."""
+    print(f"{run.way}: {run.seconds:.1f} s, {run.num_registered}/{run.num_images} images", flush=True)
 
 
 if __name__ == "__main__":

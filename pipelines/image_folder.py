@@ -3,8 +3,10 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import get_args
 
 import colmap_vg
+from colmap_vg.options import Matching
 from colmap_vg.stages import StageEvent
 
 
@@ -20,7 +22,7 @@ def main() -> None:
     parser.add_argument("image_path", type=Path, help="folder of photographs")
     parser.add_argument("output_path", type=Path, help="receives database.db and the models 0, 1, ...")
     parser.add_argument("--camera_mode", default="auto", choices=["auto", "single", "per_folder", "per_image"])
-    parser.add_argument("--matching", default="exhaustive", choices=["exhaustive", "sequential", "spatial"])
+    parser.add_argument("--matching", default="auto", choices=get_args(Matching))
     parser.add_argument("--overwrite", action="store_true", help="replace models that are there already")
     arguments = parser.parse_args()
     features = colmap_vg.FeatureOptions(camera_mode=arguments.camera_mode, matching=arguments.matching)

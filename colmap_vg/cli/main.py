@@ -12,8 +12,10 @@ from colmap_vg._version import __version__
 from colmap_vg.cli import colmap_flags
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.errors import ColmapVgError, OptionError
-from colmap_vg.options import QUALITIES, FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.options import Matching as MatchingOption
 from colmap_vg.options import Method as SolverMethod
+from colmap_vg.options import Quality as QualityPreset
 
 INTERRUPTED = 130
 """Exit code of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
@@ -44,23 +46,31 @@ CameraParams = Annotated[
 CameraMode = Annotated[
     str, typer.Option("--camera_mode", metavar="auto|single|per_folder|per_image", help="Which images share a camera.")
 ]
-Matching = Annotated[
+Quality = Annotated[
     str,
     typer.Option(
-        "--matching",
-        metavar="auto|exhaustive|selected|sequential|spatial",
-        help="Which pairs are matched; auto: all, in folders of more than 60 images the selected ones.",
+        "--quality",
+        metavar="|".join(get_args(QualityPreset)),
+        help="Image size, features and pairs; the flags for them win.",
     ),
+]
+Matching = Annotated[
+    str | None,
+    typer.Option(
+        "--matching",
+        metavar="|".join(get_args(MatchingOption)),
+        help="Which pairs are matched; auto: all, in folders of more than 20 images the selected ones.",
+    ),
+]
+SequentialOverlap = Annotated[
+    int,
+    typer.Option("--sequential_overlap", help="Followers that each image is matched with, for sequential matching."),
 ]
 ImageListPath = Annotated[
     Path | None, typer.Option("--image_list_path", help="Text file with one image name a line: only these are used.")
 ]
 MaskPath = Annotated[
     Path | None, typer.Option("--mask_path", help="Folder of masks, NAME.png for image NAME; black hides features.")
-]
-QualityFlag = Annotated[
-    str,
-    typer.Option("--quality", metavar="|".join(QUALITIES), help="Image size and features, where not given themselves."),
 ]
 MaxImageSize = Annotated[int | None, typer.Option("--max_image_size", help="Pixels; -1: COLMAP's default.")]
 MaxNumFeatures = Annotated[int | None, typer.Option("--max_num_features", help="SIFT features per image, at most.")]
@@ -126,8 +136,9 @@ def run(
     camera_model: CameraModel = "SIMPLE_RADIAL",
     camera_params: CameraParams = "",
     camera_mode: CameraMode = "auto",
-    matching: Matching = "auto",
-    quality: QualityFlag = "high",
+    quality: Quality = "high",
+    matching: Matching = None,
+    sequential_overlap: SequentialOverlap = FeatureOptions.sequential_overlap,
     image_list_path: ImageListPath = None,
     mask_path: MaskPath = None,
     max_image_size: MaxImageSize = None,
@@ -156,16 +167,16 @@ def run(
 ) -> None:
     """From a folder of photographs to models: features, matching, viewing graph, triangulation, bundle adjustment."""
     with _job(quiet, verbose) as reporter:
-        size, number = _quality(quality)
-        features = FeatureOptions(
+        given = {"matching": matching, "max_image_size": max_image_size, "max_num_features": max_num_features}
+        features = FeatureOptions.of_quality(
+            quality,  # type: ignore[arg-type]  # checked there
+            **{name: value for name, value in given.items() if value is not None},
             camera_model=camera_model,
             camera_params=_numbers("--camera_params", camera_params),
-            camera_mode=camera_mode,  # type: ignore[arg-type]  # checked by the dataclass
-            matching=matching,  # type: ignore[arg-type]
+            camera_mode=camera_mode,
             image_list_path=image_list_path,
             mask_path=mask_path,
-            max_image_size=size if max_image_size is None else max_image_size,
-            max_num_features=number if max_num_features is None else max_num_features,
+            sequential_overlap=sequential_overlap,
             num_threads=num_threads,
             random_seed=_seed(random_seed),
         )
@@ -389,13 +400,6 @@ def _numbers(flag: str, text: str) -> tuple[float, ...]:
         return tuple(float(part) for part in text.split(",")) if text.strip() else ()
     except ValueError:
         raise typer.BadParameter(f"{flag} takes numbers separated by commas, found {text!r}") from None
-
-
-def _quality(name: str) -> tuple[int, int]:
-    for quality, size_and_number in QUALITIES.items():
-        if quality == name:
-            return size_and_number
-    raise OptionError(f"--quality is {name!r}; choose one of {', '.join(QUALITIES)}")
 
 
 def _seed(random_seed: int) -> int:

@@ -1,4 +1,4 @@
-"""Features and matches of a folder of photographs, into a COLMAP database.
+"""Features of a folder of photographs, into a COLMAP database, and their matches.
 
 pycolmap reads the EXIF orientation itself: features are found on the upright image, and written in the pixels of the
 image as it is stored, with the camera of the stored size. So photographs of one phone share their camera's geometry
@@ -10,24 +10,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
 
 from colmap_vg.errors import ImageFolderError, OptionError
-from colmap_vg.features.pair_selection import largest_features, promising_pairs
-from colmap_vg.features.photographs import SkippedFile, find_photographs, split_odd_sizes, split_unmasked
+from colmap_vg.features.matching import match_features, restore_names
+from colmap_vg.features.photographs import MIN_IMAGES, SkippedFile, find_photographs, split_odd_sizes, split_unmasked
 from colmap_vg.options import FeatureOptions
 from colmap_vg.stages import StageLog
 
-MIN_IMAGES = 3
-"""Images; two views have no redundancy that could tell a right model from a wrong one."""
-
 UNREADABLE = "COLMAP cannot read it"
 
-MAX_EXHAUSTIVE = 60
-"""Images; in larger folders pairs are chosen before they are matched, unless asked otherwise."""
 IMAGES_PER_CALL = 8
 """Images per thread and call of pycolmap: progress is told between calls, and a call ends with idle threads."""
 
@@ -207,6 +201,7 @@ def _import_images(
     log: StageLog,
 ) -> tuple[list[str], list[SkippedFile]]:
     """Number images and cameras by name, in one thread: extraction alone numbers them as its threads end."""
+    restore_names(database_path)
     known = _image_names(database_path)
     new = [name for name in names if name not in known]
     if new:
@@ -257,85 +252,3 @@ def _camera_mode(options: FeatureOptions) -> pycolmap.CameraMode:
 def _image_names(database_path: str | PathLike[str]) -> set[str]:
     with pycolmap.Database.open(database_path) as database:
         return {image.name for image in database.read_all_images()}
-
-
-def match_features(database_path: str | PathLike[str], options: FeatureOptions, log: StageLog) -> int:
-    """Match the features of a database's images and verify the pairs; pairs that it already holds are kept.
-
-    Returns
-    -------
-    int
-        Number of verified pairs in the database.
-
-    Raises
-    ------
-    ImageFolderError
-        Spatial matching is asked for, and the photographs have no GPS positions.
-    """
-    with log.stage("matching"):
-        return _match(database_path, options, log)
-
-
-def _match(database_path: str | PathLike[str], options: FeatureOptions, log: StageLog) -> int:
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.num_threads = options.num_threads
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.random_seed
-    device = pycolmap.Device.cpu
-    chosen = None
-    if options.matching == "selected" or (options.matching == "auto" and _num_images(database_path) > MAX_EXHAUSTIVE):
-        chosen = _select_pairs(Path(database_path), options, log)
-    if chosen is not None:
-        with TemporaryDirectory() as folder:
-            listed = pycolmap.ImportedPairingOptions()
-            listed.match_list_path = str(Path(folder) / "pairs.txt")
-            Path(listed.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in chosen), encoding="utf-8")
-            pycolmap.match_image_pairs(database_path, matching, listed, verification, device)
-    elif options.matching in ("auto", "exhaustive", "selected"):
-        pairing = pycolmap.ExhaustivePairingOptions()
-        pycolmap.match_exhaustive(database_path, matching, pairing, verification, device)
-    elif options.matching == "sequential":
-        sequential = pycolmap.SequentialPairingOptions()
-        sequential.overlap = options.sequential_overlap
-        sequential.num_threads = options.num_threads
-        pycolmap.match_sequential(database_path, matching, sequential, verification, device)
-    else:
-        _require_positions(database_path)
-        spatial = pycolmap.SpatialPairingOptions()
-        spatial.num_threads = options.num_threads
-        pycolmap.match_spatial(database_path, matching, spatial, verification, device)
-    with pycolmap.Database.open(database_path) as database:
-        num_matched = database.num_matched_image_pairs()
-        num_verified = sum(count > 0 for count in database.read_two_view_geometry_num_inliers()[1])
-    log.result(f"{num_verified} verified of {num_matched} matched pairs")
-    return int(num_verified)
-
-
-def _select_pairs(database_path: Path, options: FeatureOptions, log: StageLog) -> list[tuple[str, str]] | None:
-    """Names of the pairs to match; None where names with spaces cannot stand in COLMAP's list of pairs."""
-    with pycolmap.Database.open(database_path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-    if any(len(name.split()) != 1 for name in names.values()):
-        log.warn("All pairs are matched: names of photographs with spaces in them do not go into a list of pairs.")
-        return None
-    log.progress("choosing pairs")
-    threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
-    pairs = promising_pairs(largest_features(database_path), threads)
-    log.progress(f"{len(pairs)} of {len(names) * (len(names) - 1) // 2} pairs are worth matching")
-    return [(names[a], names[b]) for a, b in pairs.tolist()]
-
-
-def _num_images(database_path: str | PathLike[str]) -> int:
-    with pycolmap.Database.open(database_path) as database:
-        return int(database.num_images())
-
-
-def _require_positions(database_path: str | PathLike[str]) -> None:
-    with pycolmap.Database.open(database_path) as database:
-        positions = [prior.position for prior in database.read_all_pose_priors()]
-    num_located = sum(bool(np.all(np.isfinite(position))) for position in positions)
-    if num_located < MIN_IMAGES:
-        raise ImageFolderError(
-            f"{num_located} photographs have a GPS position; spatial matching needs them: use --matching exhaustive"
-        )

@@ -23,7 +23,8 @@ import pycolmap
 
 from colmap_vg import errors
 from colmap_vg.errors import ColmapVgError, ImageFolderError, OutputError
-from colmap_vg.features.extraction import extract_features, match_features
+from colmap_vg.features.extraction import extract_features
+from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import SkippedFile
 from colmap_vg.options import FeatureOptions
 from colmap_vg.stages import StageEvent, StageLog

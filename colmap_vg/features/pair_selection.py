@@ -1,161 +1,244 @@
-"""Which pairs of images are worth matching, by a first look at their largest features alone.
+"""Which pairs of images are worth matching: the strongest features of all are matched first (preemptive matching).
 
-Wu, "Towards Linear-Time Incremental Structure from Motion" (3DV 2013), §3.1: the features of largest scale survive
-changes of view, and few of them tell whether two images overlap. Here a pair's mutual best matches among them vote with
-their turn and change of scale, which matches of the same surface share and chance matches do not: at one turn and scale
-in common, eight votes are few for a pair that overlaps and many for one that does not.
+The features of the largest scales are few, seen from afar, and stable, so pairs that see the same thing have some of
+them in common (C. Wu, Towards Linear-Time Incremental Structure from Motion, 3DV 2013, section 3). What they have in
+common by chance is told apart as in weak geometric consistency (Jégou, Douze and Schmid, ECCV 2008): right matches of a
+pair agree on how far the image is turned and scaled, wrong ones do not.
+
+The descriptors are bytes, and their products, sums of 128 integers below 2**16, are exact in single precision: the
+result does not depend on the BLAS library, its threads or the order of the images' pairs.
 """
 
-import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from colmap_vg.linear.threads import single_threaded_blas
 
-Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
+STRONGEST_SHARE = 8
+"""One of so many features is matched first, by the median over the images."""
+STRONGEST_LIMITS = (300, 1000)
+"""Features of each image that are matched first, at least and at most."""
+_MAX_RATIO = 0.8
+"""Of the distances to the nearest and the second nearest descriptor, as in the matching that follows."""
+_SQUARED_NORM = 512.0**2
+"""Of descriptors as COLMAP stores them: unit vectors times 512, rounded to bytes."""
+_ROTATION_BINS = 12
+_SCALE_BINS = 10
+"""Octaves, of which the first and the last take what is beyond them."""
+_CHANCE = 0.2
+"""Share of wrong matches that agree: they favour the scales that are frequent, and images held the same way."""
+_KEPT = 0.98
+"""Share of what all pairs promise; of four scenes the chosen pairs kept 97 to 99.9 % of the inlier matches."""
+MIN_PARTNERS = 8
+"""Images with which each image is matched at least, promising or not."""
 
-FEATURES_PER_IMAGE = 400
-MAX_ANGLE, MAX_RATIO = 0.8, 0.85
-"""Radians between matched descriptors, and over the angle to the second best: looser than in matching."""
-TURN_BINS, SCALE_BINS, SCALE_STEP = 24, 13, 0.5
-"""Of the votes' histogram; steps of scale are natural logarithms. Two bins by two count together."""
-MIN_VOTES = 8
-PARTNERS_PER_IMAGE = 12
-"""Each image is matched with so many at least, those of most votes."""
-IMAGES_PER_BLOCK = 16
+FloatArray = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+CountArray = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
-class LargestFeatures:
-    """The features of largest scale of n images; missing ones are zero.
+class StrongestFeatures:
+    """The features of largest scale of n images, up to h of each.
 
     Attributes
     ----------
-    image_ids : (n,) int64 array
-    descriptors : (n, k, 128) float32 array
-        Unit length.
-    turns : (n, k) float32 array
-        Orientations, radians.
-    log_scales : (n, k) float32 array
+    descriptors : (n, h, d) uint8 array
+        Of norm near 512; zero where an image has fewer features.
+    log2_scales : (n, h) array
+        Of the features' sizes in pixels.
+    orientations : (n, h) array
+        Radians.
     """
 
-    image_ids: IntArray
-    descriptors: Array
-    turns: Array
-    log_scales: Array
+    descriptors: NDArray[np.uint8]
+    log2_scales: NDArray[np.float64]
+    orientations: NDArray[np.float64]
 
 
-def promising_pairs(
-    features: LargestFeatures, num_threads: int, *, min_votes: int = MIN_VOTES, partners: int = PARTNERS_PER_IMAGE
-) -> IntArray:
-    """Pairs of images whose largest features agree, and the best partners of each image.
+def num_strongest(num_features: Sequence[int]) -> int:
+    """How many features of each image are matched first, given how many the images have."""
+    typical = int(np.median(num_features)) if len(num_features) else 0
+    return int(np.clip(typical // STRONGEST_SHARE, *STRONGEST_LIMITS))
+
+
+def strongest(keypoints: NDArray[np.float32], most: int) -> IntArray:
+    """Rows of the keypoints of largest scale, the largest first; of equal ones the first.
 
     Parameters
     ----------
-    features : LargestFeatures
+    keypoints : (k, 6) array
+        x, y and the affine shape a11, a12, a21, a22, as in COLMAP's databases.
+    most : int
+    """
+    return np.argsort(-_log2_scales(keypoints), kind="stable")[:most]
+
+
+def strongest_features(keypoints: list[NDArray[np.float32]], descriptors: list[NDArray[np.uint8]]) -> StrongestFeatures:
+    """Put the given features of all images, (k, 6) and (k, d) of each, side by side."""
+    most = max((len(own) for own in keypoints), default=0)
+    width = max((own.shape[1] for own in descriptors), default=0)
+    block = np.zeros((len(keypoints), most, width), np.uint8)
+    scales, orientations = np.zeros(block.shape[:2]), np.zeros(block.shape[:2])
+    for image, (points, bytes_) in enumerate(zip(keypoints, descriptors, strict=True)):
+        block[image, : len(points), : bytes_.shape[1]] = bytes_
+        scales[image, : len(points)] = _log2_scales(points)
+        orientations[image, : len(points)] = np.arctan2(points[:, 4], points[:, 2])
+    return StrongestFeatures(block, scales, orientations)
+
+
+def _log2_scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
+    shape = keypoints[:, 2:6].astype(np.float64)
+    area = np.abs(shape[:, 0] * shape[:, 3] - shape[:, 1] * shape[:, 2])
+    return np.asarray(0.5 * np.log2(np.maximum(area, np.finfo(np.float32).tiny)))
+
+
+@single_threaded_blas
+def preemptive_matches(
+    features: StrongestFeatures, num_threads: int, on_progress: Callable[[float], None] = lambda _: None
+) -> tuple[CountArray, CountArray]:
+    """Match the strongest features of all pairs of images.
+
+    Parameters
+    ----------
+    features : StrongestFeatures
     num_threads : int
-        The result does not depend on it.
-    min_votes : int
-    partners : int
+        Threads, each with one of BLAS; the result does not depend on them.
+    on_progress : callable, optional
+        Called with the share that is done.
+
+    Returns
+    -------
+    num_matches : (n, n) int32 array
+        Mutually nearest features that pass the ratio test; symmetric.
+    num_consistent : (n, n) int32 array
+        The most of them that agree on a rotation within 60 degrees and a change of scale within two octaves; symmetric.
+    """
+    n = len(features.descriptors)
+    matches, consistent = np.zeros((n, n), np.int32), np.zeros((n, n), np.int32)
+
+    def match_with_later(first: int) -> None:
+        descriptors = features.descriptors[first].astype(np.float32)
+        products = np.empty((len(descriptors), len(descriptors)), np.float32)
+        for second in range(first + 1, n):
+            rows, columns = mutual_matches(descriptors, features.descriptors[second].astype(np.float32), products)
+            matches[first, second] = matches[second, first] = len(rows)
+            consistent[first, second] = consistent[second, first] = _most_consistent(
+                features.orientations[first, rows] - features.orientations[second, columns],
+                features.log2_scales[first, rows] - features.log2_scales[second, columns],
+            )
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        done = 0
+        for first, _ in enumerate(pool.map(match_with_later, range(n))):
+            done += n - 1 - first
+            on_progress(done / max(n * (n - 1) // 2, 1))
+    return matches, consistent
+
+
+def mutual_matches(
+    first: FloatArray, second: FloatArray, products: FloatArray | None = None
+) -> tuple[IntArray, IntArray]:
+    """Rows of two sets of descriptors that are each other's nearest, and nearer than the next by the ratio test.
+
+    Parameters
+    ----------
+    first, second : (h, d), (k, d) arrays
+        Descriptors of norm near 512; rows of zeros match nothing.
+    products : (h, k) array, optional
+        Room to work in: fresh memory for each pair costs as much as the products themselves.
+    """
+    if not len(first) or not len(second):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    products = np.matmul(first, second.T, out=products)
+    nearest = products.argmax(axis=1)
+    best = products[np.arange(len(first)), nearest]
+    rows = np.flatnonzero(products.max(axis=0)[nearest] == best)  # the largest: argmax along columns takes far longer
+    columns, best = nearest[rows], best[rows]
+    products[rows, columns] = 0.0
+    rivals = products.max(axis=1)[rows]
+    # Squared distances of unit vectors are 2 - 2 cos; what rounding leaves of the norm counts for nothing here.
+    passed = _SQUARED_NORM - best < _MAX_RATIO**2 * (_SQUARED_NORM - rivals)
+    return rows[passed], columns[passed]
+
+
+def _most_consistent(turned: NDArray[np.float64], scaled: NDArray[np.float64]) -> int:
+    """The most votes in two by two neighbouring bins of rotation, which is cyclic, and scale."""
+    rotation = np.floor(turned * (_ROTATION_BINS / (2 * np.pi))).astype(np.int64) % _ROTATION_BINS
+    scale = np.clip(np.floor(scaled).astype(np.int64) + _SCALE_BINS // 2, 0, _SCALE_BINS - 1)
+    votes = np.bincount(rotation * _SCALE_BINS + scale, minlength=_ROTATION_BINS * _SCALE_BINS)
+    votes = votes.reshape(_ROTATION_BINS, _SCALE_BINS)
+    votes = votes + np.roll(votes, 1, axis=0)
+    return int((votes[:, 1:] + votes[:, :-1]).max())
+
+
+def promise(num_matches: CountArray, num_consistent: CountArray) -> NDArray[np.float64]:
+    """What each pair of images promises, in consistent matches of its strongest features.
+
+    These are the matches by which a pair exceeds chance, two standard deviations included, and as much again by way of
+    third images: two that have much in common with the same ones are likely to have something in common, too.
+
+    Parameters
+    ----------
+    num_matches, num_consistent : (n, n) int32 arrays
+        From :func:`preemptive_matches`.
+
+    Returns
+    -------
+    (n, n) array
+    """
+    by_chance = _CHANCE * num_matches
+    excess = np.maximum(num_consistent - by_chance - 2.0 * np.sqrt(by_chance), 0.0)
+    degree = excess.sum(axis=0) + 1.0
+    linked = excess / np.sqrt(np.outer(degree, degree))
+    through_others = linked @ linked
+    np.fill_diagonal(through_others, 0.0)
+    if through_others.any():
+        excess = excess + through_others * (excess.sum() / through_others.sum())
+    return np.asarray(np.round(excess, 6))  # so that the order does not hang on the last bit of a product
+
+
+@single_threaded_blas
+def select_pairs(num_matches: CountArray, num_consistent: CountArray, min_partners: int = MIN_PARTNERS) -> IntArray:
+    """Pairs that are worth matching in full.
+
+    These are the pairs that promise most, until together they promise nearly all there is, the best partners of each
+    image, and the best pairs that connect all images. Among equals, images that follow one another come first.
+
+    Parameters
+    ----------
+    num_matches, num_consistent : (n, n) int32 arrays
+        From :func:`preemptive_matches`.
+    min_partners : int
 
     Returns
     -------
     (m, 2) int64 array
-        Image ids, the first below the second, in rising order.
+        Rows of images, ``first < second``, in lexicographic order.
     """
-    votes = all_votes(features, num_threads)
-    n = len(votes)
-    kept = votes >= min_votes
-    # Ties go to the nearest names: photographs that follow each other overlap more often than not.
-    nearness = np.abs(np.arange(n)[:, None] - np.arange(n))
-    order = np.lexsort((nearness, -votes), axis=1)
-    best = order[:, :partners]
-    chosen = np.zeros_like(kept)
-    np.put_along_axis(chosen, best, True, axis=1)
-    kept |= chosen | chosen.T
-    first, second = np.nonzero(np.triu(kept, 1))
-    pairs = np.stack([features.image_ids[first], features.image_ids[second]], axis=1)
-    return np.asarray(np.sort(pairs, axis=1)[np.lexsort((pairs.max(axis=1), pairs.min(axis=1)))], dtype=np.int64)
-
-
-@single_threaded_blas
-def all_votes(features: LargestFeatures, num_threads: int) -> IntArray:
-    """Votes for the turn and scale that most matches of each pair share: (n, n), symmetric; -1 on the diagonal."""
-    n = len(features.image_ids)
-    votes = np.full((n, n), -1, dtype=np.int64)
-
-    def row(image: int) -> None:
-        for start in range(image + 1, n, IMAGES_PER_BLOCK):
-            others = slice(start, min(start + IMAGES_PER_BLOCK, n))
-            votes[image, others] = _votes(features, image, others)
-
-    with ThreadPoolExecutor(num_threads) as pool:
-        list(pool.map(row, range(n)))
-    return np.maximum(votes, votes.T)
-
-
-def _votes(features: LargestFeatures, image: int, others: slice) -> IntArray:
-    own, theirs = features.descriptors[image], features.descriptors[others]
-    count, k, _ = theirs.shape
-    similarity = (own @ theirs.reshape(count * k, -1).T).reshape(k, count, k)
-    best = similarity.argmax(axis=2)  # (k, count)
-    mutual = np.take_along_axis(similarity.argmax(axis=0).T, best, axis=0) == np.arange(k)[:, None]
-    first = np.take_along_axis(similarity, best[:, :, None], axis=2)
-    np.put_along_axis(similarity, best[:, :, None], -1.0, axis=2)
-    angle, second = (np.arccos(np.clip(s, -1.0, 1.0)) for s in (first[:, :, 0], similarity.max(axis=2)))
-    good = mutual & (angle < MAX_ANGLE) & (angle < MAX_RATIO * second)
-    mine, pair = np.nonzero(good)
-    other = best[good]
-    turn = np.mod(features.turns[others][pair, other] - features.turns[image, mine], 2.0 * np.pi)
-    scale = features.log_scales[others][pair, other] - features.log_scales[image, mine]
-    turn_bin = np.minimum((turn * (TURN_BINS / (2.0 * np.pi))).astype(np.int64), TURN_BINS - 1)
-    scale_bin = np.clip(np.round(scale / SCALE_STEP) + SCALE_BINS // 2, 0, SCALE_BINS - 1).astype(np.int64)
-    cell = (pair * TURN_BINS + turn_bin) * SCALE_BINS + scale_bin
-    table = np.bincount(cell, minlength=count * TURN_BINS * SCALE_BINS).reshape(count, TURN_BINS, SCALE_BINS)
-    table = table + np.roll(table, -1, axis=1)
-    return np.asarray((table[:, :, :-1] + table[:, :, 1:]).max(axis=(1, 2)), dtype=np.int64)
-
-
-def largest_features(database_path: Path, num_features: int = FEATURES_PER_IMAGE) -> LargestFeatures:
-    """Read the features of largest scale of all images of a database that COLMAP's extraction wrote.
-
-    Parameters
-    ----------
-    database_path : Path
-    num_features : int
-        Of each image.
-    """
-    rows = list(_features(database_path))
-    n = len(rows)
-    descriptors = np.zeros((n, num_features, 128), dtype=np.float32)
-    turns, log_scales = np.zeros((2, n, num_features), dtype=np.float32)
-    for place, (_, shapes, values) in enumerate(rows):
-        scale = np.sqrt(np.abs(np.linalg.det(shapes)))
-        largest = np.argsort(-scale, kind="stable")[:num_features]
-        own = values[largest].astype(np.float32)
-        descriptors[place, : len(own)] = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-9)
-        turns[place, : len(own)] = np.arctan2(shapes[largest, 1, 0], shapes[largest, 0, 0])
-        log_scales[place, : len(own)] = np.log(np.maximum(scale[largest], 1e-6))
-    return LargestFeatures(np.array([row[0] for row in rows], dtype=np.int64), descriptors, turns, log_scales)
-
-
-def _features(database_path: Path) -> Iterator[tuple[int, Array, NDArray[np.uint8]]]:
-    """Image id, shapes (k, 2, 2) of its keypoints, and descriptors (k, 128), by the images' names."""
-    statement = (
-        "SELECT images.image_id, keypoints.rows, keypoints.cols, keypoints.data, descriptors.data FROM images"
-        " JOIN keypoints ON keypoints.image_id = images.image_id"
-        " JOIN descriptors ON descriptors.image_id = images.image_id"
-        " WHERE keypoints.rows > 0 ORDER BY images.name"
-    )
-    with closing(sqlite3.connect(f"{database_path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
-        for image_id, rows, cols, keypoints, descriptors in connection.execute(statement):
-            own = np.frombuffer(keypoints, dtype=np.float32).reshape(rows, cols)
-            shapes = own[:, 2:6].reshape(rows, 2, 2)
-            yield image_id, shapes, np.frombuffer(descriptors, dtype=np.uint8).reshape(rows, 128)
+    n = len(num_matches)
+    if n < 2:
+        return np.empty((0, 2), np.int64)
+    first, second = np.triu_indices(n, 1)
+    promised = promise(num_matches, num_consistent)[first, second]
+    order = np.lexsort((second - first, -num_matches[first, second], -num_consistent[first, second], -promised))
+    rank = np.empty(len(first), np.int64)
+    rank[order] = np.arange(1, len(first) + 1)
+    ranks = np.zeros((n, n), np.int64)
+    ranks[first, second] = rank
+    before = np.concatenate([[0.0], np.cumsum(promised[order])])[:-1]
+    chosen = np.zeros((n, n), dtype=bool)
+    chosen[first[order], second[order]] = before < _KEPT * promised.sum()
+    chosen[minimum_spanning_tree(ranks).nonzero()] = True
+    chosen |= chosen.T
+    ranks += ranks.T
+    np.fill_diagonal(ranks, len(first) + 1)
+    limit = np.sort(ranks, axis=1)[:, min(min_partners, n - 1) - 1]
+    chosen |= ranks <= np.maximum(limit[:, None], limit[None, :])
+    np.fill_diagonal(chosen, False)
+    return np.argwhere(np.triu(chosen)).astype(np.int64)

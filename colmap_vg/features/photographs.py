@@ -18,6 +18,9 @@ import pycolmap
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.options import CameraMode
 
+MIN_IMAGES = 3
+"""Images; two views have no redundancy that could tell a right model from a wrong one."""
+
 MIN_SIDE = 32
 """Pixels; SIFT finds nothing that could be matched in a smaller image."""
 

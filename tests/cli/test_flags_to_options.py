@@ -131,6 +131,31 @@ def test_quality_sets_what_is_not_given(jobs: Jobs) -> None:
     assert features("--max_image_size", "500", "--quality", "extreme") == (500, 16384)
 
 
+def features(jobs: Jobs, *flags: str) -> FeatureOptions:
+    options = called(jobs, "run", "--image_path", "i", "--output_path", "o", *flags)[2]
+    assert isinstance(options, FeatureOptions)
+    return options
+
+
+def test_quality_stands_for_features_and_explicit_flags_win(jobs: Jobs) -> None:
+    assert features(jobs, "--quality", "high") == FeatureOptions()
+    for quality in ("low", "medium", "extreme"):
+        assert features(jobs, "--quality", quality) == FeatureOptions.of_quality(quality) != FeatureOptions()
+    low = FeatureOptions.of_quality("low")
+    assert features(jobs, "--quality", "low", "--max_num_features", "8192").max_num_features == 8192
+    assert features(jobs, "--quality", "low", "--max_num_features", "8192").max_image_size == low.max_image_size
+    assert features(jobs, "--max_image_size", "-1", "--quality", "low").max_image_size == -1
+    assert features(jobs, "--quality", "extreme", "--matching", "auto").matching == "auto"
+    assert features(jobs, "--matching", "sequential", "--sequential_overlap", "3").sequential_overlap == 3
+
+
+def test_unknown_quality_and_matching_are_usage_errors(jobs: Jobs) -> None:
+    for flags, words in ((("--quality", "best"), "low, medium"), (("--matching", "tree"), "selected")):
+        result = CliRunner().invoke(app, ["run", "--image_path", "i", "--output_path", "o", *flags])
+        assert result.exit_code == 2
+        assert words in result.output
+
+
 def test_demo_flags(jobs: Jobs) -> None:
     assert called(jobs, "demo", "--output_path", "o")[:3] == (Path("o"), 24, 0)
     assert called(jobs, "demo", "--output_path", "o", "--num_images", "6", "--seed", "5")[:3] == (Path("o"), 6, 5)

@@ -1,0 +1,187 @@
+"""The chosen pairs are matched as pycolmap matches them, whatever the images are called and however a job ended."""
+
+import struct
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from rendered_corner import Corner, render_corner, write_jpeg
+
+from colmap_vg.errors import ImageFolderError
+from colmap_vg.features import matching
+from colmap_vg.features.extraction import extract_and_match
+from colmap_vg.features.matching import match_features, match_pairs, promising_pairs, restore_names
+from colmap_vg.features.pair_selection import select_pairs
+from colmap_vg.options import FeatureOptions
+from colmap_vg.stages import StageLog
+
+QUICK = FeatureOptions(num_threads=2, max_num_features=500, max_image_size=240)
+NAMES = ("a photo (1).jpg", "#2.jpg", "füñf/100 %.jpg", "plain.jpg")
+
+
+@pytest.fixture(scope="module")
+def corner() -> Corner:
+    return render_corner(4)
+
+
+@pytest.fixture
+def images(tmp_path: Path, corner: Corner) -> Path:
+    for name, image in zip(NAMES, corner.images, strict=True):
+        path = tmp_path / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_jpeg(path, image)
+    return tmp_path / "images"
+
+
+def matched(path: Path) -> dict[tuple[str, str], np.ndarray]:
+    with pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        pairs = [(a, b) for a in names for b in names if a < b and database.exists_matches(a, b)]
+        return {(names[a], names[b]): database.read_two_view_geometry(a, b).inlier_matches for a, b in pairs}
+
+
+def test_selected_pairs_have_the_matches_of_exhaustive_matching(tmp_path: Path, images: Path) -> None:
+    extract_and_match(images, tmp_path / "all.db", replace(QUICK, matching="exhaustive"))
+    result = extract_and_match(images, tmp_path / "some.db", replace(QUICK, matching="selected"))
+    every, some = matched(tmp_path / "all.db"), matched(tmp_path / "some.db")
+    assert set(result.image_names) == set(NAMES)
+    assert {name for pair in some for name in pair} == set(NAMES)
+    assert sum(map(len, some.values())) >= 0.97 * sum(map(len, every.values()))
+    for pair, rows in some.items():
+        np.testing.assert_array_equal(rows, every[pair])
+
+
+def test_given_pairs_are_matched_and_no_others(tmp_path: Path, images: Path) -> None:
+    path = tmp_path / "a.db"
+    extract_and_match(images, path, replace(QUICK, matching="sequential", sequential_overlap=1))
+    with pycolmap.Database.open(path) as database:
+        database.clear_matches()
+        database.clear_two_view_geometries()
+    log = StageLog()
+    with log.stage("matching"):
+        match_pairs(path, [(NAMES[1], NAMES[0]), (NAMES[3], NAMES[2])], QUICK, log)
+    assert {frozenset(pair) for pair in matched(path)} == {frozenset(NAMES[:2]), frozenset(NAMES[2:])}
+    assert sorted(file.name for file in tmp_path.iterdir() if file.is_file()) == ["a.db"]
+
+
+def test_names_come_back_after_a_job_that_was_killed(tmp_path: Path, images: Path) -> None:
+    path = tmp_path / "a.db"
+    extract_and_match(images, path, replace(QUICK, matching="selected"))
+    before = matched(path)
+    names = matching._names_for_lists(path)
+    names.__enter__()  # and never left: the job is killed
+    with pycolmap.Database.open(path) as database:
+        assert not {image.name for image in database.read_all_images()} & set(NAMES[:2])
+    again = extract_and_match(images, path, replace(QUICK, matching="selected"))
+    assert set(again.image_names) == set(NAMES)
+    assert set(matched(path)) == set(before)
+    restore_names(path)
+    assert set(matched(path)) == set(before)
+
+
+def test_interrupted_matching_goes_on_with_what_is_missing(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, options = tmp_path / "a.db", replace(QUICK, matching="selected")
+    extract_and_match(images, path, options)
+    before = matched(path)
+    with pycolmap.Database.open(path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        first, *_ = before
+        database.delete_matches(*(ids[name] for name in first))
+        database.delete_two_view_geometry(*(ids[name] for name in first))
+    assert set(matched(path)) == set(before) - {first}
+    match_features(path, options, StageLog())
+    after = matched(path)
+    assert set(after) == set(before)
+    for pair in before:
+        np.testing.assert_array_equal(before[pair], after[pair])
+
+
+def test_auto_matches_all_pairs_of_few_images_only(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.db"
+    extract_and_match(images, path, QUICK)
+    assert len(matched(path)) == 6
+    with pycolmap.Database.open(path) as database:
+        database.clear_matches()
+        database.clear_two_view_geometries()
+    monkeypatch.setattr(matching, "MAX_EXHAUSTIVE", 3)
+    monkeypatch.setattr(matching, "promising_pairs", lambda *_: [(NAMES[0], NAMES[1])])
+    log = StageLog()
+    match_features(path, QUICK, log)
+    assert len(matched(path)) == 1
+    assert "chosen from 6" in log.records[-1].message
+
+
+def test_a_photograph_of_something_else_costs_few_pairs(tmp_path: Path, corner: Corner) -> None:
+    corner.write(tmp_path / "images")
+    rng = np.random.default_rng(0)
+    for index in range(4):
+        write_jpeg(tmp_path / "images" / f"noise{index}.jpg", rng.integers(0, 255, (360, 480, 3)).astype(np.uint8))
+    extract_and_match(tmp_path / "images", tmp_path / "a.db", QUICK)
+    log = StageLog()
+    with log.stage("pairs"), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(matching, "select_pairs", partial(select_pairs, min_partners=1))
+        pairs = promising_pairs(tmp_path / "a.db", 2, log)
+    noisy = [pair for pair in pairs if any(name.startswith("noise") for name in pair)]
+    assert len(pairs) - len(noisy) >= 4
+    assert len(noisy) <= 6  # of 22
+
+
+def test_photographs_without_features_are_no_obstacle(tmp_path: Path, images: Path) -> None:
+    cv2.imwrite(str(images / "blank.png"), np.zeros((360, 480, 3), np.uint8))
+    options = replace(QUICK, matching="selected")
+    result = extract_and_match(images, tmp_path / "a.db", options)
+    assert result.num_verified_pairs >= 3
+    log = StageLog()
+    with log.stage("pairs"):
+        pairs = promising_pairs(tmp_path / "a.db", 1, log)
+    assert any("blank.png" in pair for pair in pairs)
+
+
+def test_spatial_matching_pairs_those_that_were_near(tmp_path: Path, corner: Corner) -> None:
+    (tmp_path / "images").mkdir()
+    for index, image in enumerate(corner.images):
+        path = tmp_path / "images" / f"{index}.jpg"
+        write_jpeg(path, image)
+        if index < 3:  # 30 m apart, then a kilometre
+            path.write_bytes(with_position(path.read_bytes(), 55.0 + (0.0, 0.00027, 0.01)[index], 13.0))
+    log = StageLog()
+    extract_and_match(tmp_path / "images", tmp_path / "a.db", replace(QUICK, matching="spatial"), log)
+    assert set(matched(tmp_path / "a.db")) == {("0.jpg", "1.jpg")}
+    assert ["3.jpg" in warning for warning in log.warnings] == [True]
+
+
+def test_spatial_matching_needs_three_positions(tmp_path: Path, corner: Corner) -> None:
+    corner.write(tmp_path / "images")
+    path = tmp_path / "images" / "00.jpg"
+    path.write_bytes(with_position(path.read_bytes(), 55.0, 13.0))
+    with pytest.raises(ImageFolderError, match=r"1 of 4 photographs .* GPS position.*--matching auto"):
+        extract_and_match(tmp_path / "images", tmp_path / "a.db", replace(QUICK, matching="spatial"))
+
+
+def with_position(jpeg: bytes, latitude: float, longitude: float) -> bytes:
+    """A JPEG with an APP1 segment that holds a GPS directory: latitude north and longitude east in degrees."""
+
+    def degrees(value: float) -> bytes:
+        return struct.pack("<IIIIII", round(value * 10**7), 10**7, 0, 1, 0, 1)
+
+    at = 8 + 2 + 12 + 4
+    values = at + 2 + 5 * 12 + 4
+    entries = [
+        struct.pack("<HHI4s", 1, 2, 2, b"N"),
+        struct.pack("<HHII", 2, 5, 3, values),
+        struct.pack("<HHI4s", 3, 2, 2, b"E"),
+        struct.pack("<HHII", 4, 5, 3, values + 24),
+        struct.pack("<HHII", 6, 5, 1, values + 48),
+    ]
+    body = b"Exif\0\0II*\0" + struct.pack("<I", 8) + struct.pack("<HHHII", 1, 0x8825, 4, 1, at) + bytes(4)
+    body += struct.pack("<H", 5) + b"".join(entries) + bytes(4)
+    body += degrees(latitude) + degrees(longitude) + struct.pack("<II", 50, 1)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
