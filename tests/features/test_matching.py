@@ -76,6 +76,10 @@ def test_names_come_back_after_a_job_that_was_killed(tmp_path: Path, images: Pat
     names.__enter__()  # and never left: the job is killed
     with pycolmap.Database.open(path) as database:
         assert not {image.name for image in database.read_all_images()} & set(NAMES[:2])
+    match_features(path, replace(QUICK, matching="selected"), StageLog())
+    assert set(matched(path)) == set(before)
+    killed_again = matching._names_for_lists(path)
+    killed_again.__enter__()
     again = extract_and_match(images, path, replace(QUICK, matching="selected"))
     assert set(again.image_names) == set(NAMES)
     assert set(matched(path)) == set(before)

@@ -93,6 +93,17 @@ def test_matches_that_turn_every_way_count_for_little() -> None:
     assert consistent[0, 1] < 35
 
 
+def test_one_turn_counts_in_full_wherever_the_bins_begin() -> None:
+    rng = np.random.default_rng(7)
+    shared, orientations = random_descriptors(rng, 60), rng.uniform(-np.pi, np.pi, 60)
+    for turned in np.linspace(-np.pi, np.pi, 24, endpoint=False):
+        both = (orientations, orientations + turned + rng.uniform(-0.1, 0.1, 60))
+        scales = (np.full(60, 4.0), 4.0 * 2.0 ** rng.uniform(-0.1, 0.1, 60))
+        points = [keypoints(rng, *own) for own in zip(scales, both, strict=True)]
+        matches, consistent = preemptive_matches(strongest_features(points, [shared, shared]), 1)
+        assert matches[0, 1] == consistent[0, 1] == 60
+
+
 def test_the_result_does_not_depend_on_threads() -> None:
     features = street(10, 4)
     for one, many in zip(preemptive_matches(features, 1), preemptive_matches(features, 4), strict=True):
@@ -165,6 +176,15 @@ def test_strongest_features_grow_with_the_features_within_limits() -> None:
     assert num_strongest([]) == num_strongest([50, 60]) == 300
     assert num_strongest([100, 4000, 9000]) == 500
     assert num_strongest([30000] * 3) == 1000
+
+
+def test_groups_that_promise_nothing_to_each_other_are_linked_once() -> None:
+    consistent = np.zeros((10, 10), np.int32)
+    consistent[:5, :5] = consistent[5:, 5:] = 50
+    np.fill_diagonal(consistent, 0)
+    pairs = select_pairs(consistent, consistent, 2).tolist()
+    assert [pair for pair in pairs if (pair[0] < 5) != (pair[1] < 5)] == [[4, 5]]
+    assert len(pairs) == 21
 
 
 def test_images_without_anything_in_common_are_linked_in_their_order() -> None:
