@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.edge_residuals import edge_residual_sigmas
-from colmap_vg.edge_weights import edge_weights
+from colmap_vg.edge_weights import edge_likelihoods, edge_weights
 from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
 from colmap_vg.epipolar.baseline_lengths import connects_all, length_links, positions_by_lengths, solve_lengths
 from colmap_vg.epipolar.covariance import camera_covariances
@@ -37,6 +37,7 @@ from colmap_vg.positions.shapefit import solve_shapefit
 from colmap_vg.robust import geman_mcclure_weight
 from colmap_vg.rotations.certificate import certify_chordal
 from colmap_vg.rotations.chordal import average_rotations_chordal
+from colmap_vg.rotations.consensus import average_rotations_by_consensus
 from colmap_vg.rotations.robust import average_rotations_robust, rotation_residuals
 from colmap_vg.solution import LogEntry, PoseSolution
 from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
@@ -137,24 +138,41 @@ class _Poses:
 
 def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) -> tuple[Array, Subgraph]:
     """Rotations of the part's images, and the part that the rotation gate leaves; gated until no edge goes."""
-    graph = ledger.graph
-    average = average_rotations_robust if options.rotation_averaging == "robust" else average_rotations_chordal
+    graph, start = ledger.graph, None
     while part.num_images >= 2:
         relative = graph.cam2_from_cam1_rotations[part.edge_rows]
         weights = edge_weights(graph, part.edge_rows, options)
-        result = average(part.num_images, part.edges, relative, weights)
-        rotations = result.cam_from_world_rotations
+        if options.rotation_averaging == "chordal":
+            result = average_rotations_chordal(part.num_images, part.edges, relative, weights)
+            rotations, log = result.cam_from_world_rotations, result.log
+        elif start is None:
+            found = average_rotations_by_consensus(
+                part.num_images,
+                part.edges,
+                relative,
+                edge_likelihoods(graph, part.edge_rows),
+                weights,
+                options.random_seed,
+            )
+            rotations, log = found.cam_from_world_rotations, found.log
+        else:
+            # The gate has only taken away what disagrees: the search is done.
+            result = average_rotations_robust(
+                part.num_images, part.edges, relative, weights, start, max_num_l1_iterations=0
+            )
+            rotations, log = result.cam_from_world_rotations, result.log
         bad = rotation_residuals(part.edges, relative, rotations) > np.radians(options.rotation_gate_deg)
         bad &= ~ledger.trusted[part.edge_rows]
         if options.rotation_gate_deg == 0.0 or not bad.any():
-            ledger.log.extend(result.log)
+            ledger.log.extend(log)
             if options.certify_rotations:
                 _certify_rotations(ledger, part, relative, rotations, weights, options)
             return rotations, part
         ledger.drop(part.edge_rows[bad], EdgeVerdict.ROTATION_OUTLIER)
         images = np.zeros(graph.num_images, dtype=bool)
         images[part.images] = True
-        part = ledger.largest_component(images, ImageVerdict.CUT_OFF)
+        smaller = ledger.largest_component(images, ImageVerdict.CUT_OFF)
+        part, start = smaller, rotations[part.rows_of(smaller.images)]
     return np.zeros((part.num_images, 3, 3)), part
 
 

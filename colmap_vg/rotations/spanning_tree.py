@@ -42,7 +42,7 @@ def rotations_from_spanning_tree(
         The graph is malformed or disconnected.
     """
     edges, relative, w = checked_problem(num_images, edges, cam2_from_cam1_rotations, weights)
-    parents, parent_edges, root = _tree(num_images, edges, w)
+    parents, parent_edges, root = spanning_tree(num_images, edges, w)
     rows = np.flatnonzero(parent_edges >= 0)
     e = parent_edges[rows]
     forward = edges[e, 1] == rows  # the edge leads from the parent to this image
@@ -55,8 +55,25 @@ def rotations_from_spanning_tree(
     return so3.project(chained)
 
 
-def _tree(num_images: int, edges: IntArray, weights: Array) -> tuple[IntArray, IntArray, int]:
-    """Parent of each image (the root's is itself), the edge to it (-1 at the root), and the root."""
+def spanning_tree(num_images: int, edges: IntArray, weights: Array) -> tuple[IntArray, IntArray, int]:
+    """Maximum-weight spanning tree of a connected graph.
+
+    Parameters
+    ----------
+    num_images : int
+    edges : (m, 2) int64 array
+    weights : (m,) array
+        Edges of weight zero are left out.
+
+    Returns
+    -------
+    parents : (n,) int64 array
+        Parent of each image; the root's is itself.
+    parent_edges : (n,) int64 array
+        Edge to the parent; -1 at the root.
+    root : int
+        The image with most edges.
+    """
     degree = np.bincount(edges.ravel(), minlength=num_images)
     usable = np.flatnonzero(weights > 0)
     ends = np.sort(edges[usable], axis=1)
