@@ -1,4 +1,4 @@
-"""How far the relative poses of edges are from solved cameras, in their own standard deviations."""
+"""How far the relative poses of edges are from solved cameras, in radians and in their own standard deviations."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,25 @@ from colmap_vg.geometry.directions import normalized, tangent_basis
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+def rotation_residuals(edges: IntArray, cam2_from_cam1_rotations: Array, cam_from_world_rotations: Array) -> Array:
+    """Angles between measured and solved relative rotations.
+
+    Parameters
+    ----------
+    edges : (m, 2) int array
+    cam2_from_cam1_rotations : (m, 3, 3) array
+    cam_from_world_rotations : (n, 3, 3) array
+
+    Returns
+    -------
+    (m,) array
+        ``angle(R_ij^T R_j R_i^T)``, radians in [0, pi].
+    """
+    R = cam_from_world_rotations
+    i, j = edges[:, 0], edges[:, 1]
+    return so3.angle(np.swapaxes(R[j], 1, 2) @ cam2_from_cam1_rotations @ R[i])
 
 
 def edge_residual_sigmas(

@@ -51,7 +51,10 @@ def edge_weights(graph: ViewGraph, edge_rows: IntArray, options: SolveOptions) -
 
 
 def edge_likelihoods(graph: ViewGraph, edge_rows: IntArray) -> Array:
-    """Evidence that chosen edges are right, however precise: their numbers of inliers, a third of that where planar.
+    """Evidence that chosen edges are right, however precise: their numbers of inliers.
+
+    Planar pairs count in full: their poses are less precise, but nine in ten of those with 60 to 120 inliers were right
+    on an object of whose other pairs with as many only one in thirty was.
 
     Parameters
     ----------
@@ -67,8 +70,6 @@ def edge_likelihoods(graph: ViewGraph, edge_rows: IntArray) -> Array:
     likelihoods = np.ones(len(edge_rows))
     if graph.num_inliers is not None:
         likelihoods = np.maximum(graph.num_inliers[edge_rows], 1.0)
-        if graph.planar is not None:
-            likelihoods = np.where(graph.planar[edge_rows], PLANAR_WEIGHT, 1.0) * likelihoods
     if len(likelihoods):
         likelihoods = likelihoods / np.median(likelihoods)
     if graph.trusted is not None:

@@ -3,18 +3,23 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.agreement import pair_agreement
 from colmap_vg.edge_residuals import edge_residual_sigmas
 from colmap_vg.geometry import so3
 from colmap_vg.graph.components import components_by_size
 from colmap_vg.graph.rigidity import largest_rigid_component
 from colmap_vg.graph.subgraph import Subgraph
-from colmap_vg.solution import LogEntry, PoseSolution
+from colmap_vg.solution import Agreement, LogEntry, PoseSolution
 from colmap_vg.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
 from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+MIN_AGREEMENT = 0.65
+"""Share of inlier matches below which a model is doubtful. Right models of objects that repeat themselves had 0.74 to
+0.95, those of other photographs 0.98 and more; models that were folded 0.64 to 0.86."""
 
 
 class Ledger:
@@ -46,6 +51,7 @@ class Ledger:
         self._seen_cameras = np.zeros(num_cameras(graph), dtype=bool)
         self._converged = True
         self._covariances: Array | None = None
+        self._in_doubt: BoolArray | None = None
 
     @property
     def usable(self) -> BoolArray:
@@ -64,6 +70,13 @@ class Ledger:
     def restore(self, edge_rows: IntArray) -> None:
         """Take dropped edges back."""
         self.edge_verdicts[edge_rows] = EdgeVerdict.KEPT
+
+    def doubt(self, images: IntArray, told: str) -> None:
+        """Note images whose place is in doubt, and the sentence that tells why."""
+        if self._in_doubt is None:
+            self._in_doubt = np.zeros(self.graph.num_images, dtype=bool)
+        self._in_doubt[images] = True
+        self.caveats.append(told)
 
     def leave_out(self, part: Subgraph, verdict: ImageVerdict) -> None:
         """Leave out the images of a part for a reason, but for those that have one."""
@@ -151,7 +164,9 @@ class Ledger:
         inside = (ends[:, 0] >= 0) & (ends[:, 0] == ends[:, 1])
         # What only told rotations keeps its word: that may be why its images are outside.
         self.edge_verdicts[(self.edge_verdicts == EdgeVerdict.KEPT) & ~inside] = EdgeVerdict.OUTSIDE
-        status, message = described(self.image_verdicts, self._converged)
+        agreement = pair_agreement(self.graph, self._R, self._p, component)
+        in_doubt = self._in_doubt is not None and bool((self._in_doubt & (component >= 0)).any())
+        status, message = described(self.image_verdicts, self._converged, agreement, in_doubt)
         still = int((self.edge_verdicts == EdgeVerdict.ROTATION_ONLY).sum())
         if status == SolutionStatus.UNSOLVABLE and still:
             message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have turned on the spot."
@@ -168,10 +183,13 @@ class Ledger:
             image_verdicts=self.image_verdicts.astype(str),
             status=status,
             message=message,
+            converged=self._converged,
             caveats=tuple(self.caveats),
             position_covariances=None if self._covariances is None else self._covariances[0],
             rotation_covariances=None if self._covariances is None else self._covariances[1],
             edge_residual_sigmas=self._edge_residual_sigmas(inside),
+            agreement=agreement,
+            in_doubt=self._in_doubt if in_doubt else None,
             log=tuple(self.log),
         )
 
@@ -191,8 +209,10 @@ class Ledger:
         return sigmas
 
 
-def described(image_verdicts: NDArray[np.generic], converged: bool) -> tuple[SolutionStatus, str]:
-    """Status of a solution, and the sentence that tells it."""
+def described(
+    image_verdicts: NDArray[np.generic], converged: bool, agreement: tuple[Agreement, ...], in_doubt: bool
+) -> tuple[SolutionStatus, str]:
+    """Status of a solution, and the sentences that tell it."""
     words, counts = np.unique(image_verdicts.astype(str), return_counts=True)
     elsewhere = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
     if sum(elsewhere.values()) == len(image_verdicts):
@@ -209,6 +229,16 @@ def described(image_verdicts: NDArray[np.generic], converged: bool) -> tuple[Sol
     if not converged:
         status = SolutionStatus.NOT_CONVERGED
         message += " The iteration limit was reached: raise max_num_iterations, or look for outliers in the graph."
+    if agreement:
+        shares = f"{agreement[0].inliers:.3f} of the inlier matches and {agreement[0].pairs:.3f} of the pairs"
+        message += f" {shares} agree with the model within 5°."
+    if in_doubt or any(part.inliers < MIN_AGREEMENT for part in agreement):
+        status = SolutionStatus.DOUBTFUL
+        why = "another arrangement fits nearly as well" if in_doubt else "too many pairs contradict it"
+        message += (
+            f" The model is doubtful: {why}. Look at it, exclude pairs that are wrong, or add photographs between the"
+            " views that look alike."
+        )
     return status, message
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_vg.agreement import pair_agreement
 from colmap_vg.colmap_io.database import check_database
 from colmap_vg.colmap_io.read import read_with_caveats
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
@@ -30,7 +31,7 @@ from colmap_vg.output_folder import publish_models, refuse_models, stage_models,
 from colmap_vg.solution import PoseSolution
 from colmap_vg.solve import solve_view_graph
 from colmap_vg.stages import StageEvent, StageLog
-from colmap_vg.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
+from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.view_graph import ViewGraph
 
 SAME_LENS_COST = 0.8
@@ -263,7 +264,9 @@ def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Mo
             rotations[row] = image.cam_from_world().rotation.matrix()
             centers[row] = image.projection_center()
         focal_scales = _focal_scales(focal_scales, graph, model)
-    status, message = described(words, solution.status != SolutionStatus.NOT_CONVERGED)
+    agreement = pair_agreement(graph, rotations, centers, component)
+    in_doubt = solution.in_doubt is not None or any(model.result.folded for model in models)
+    status, message = described(words, solution.converged, agreement, in_doubt)
     return replace(
         solution,
         position_covariances=_covariances_in_models(solution, centers, component),
@@ -275,6 +278,7 @@ def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Mo
         image_verdicts=words.astype(str),
         status=status,
         message=message,
+        agreement=agreement,
     )
 
 

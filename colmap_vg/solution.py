@@ -31,6 +31,29 @@ class LogEntry:
     change: float
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """Shares of a component's pairs, and of their inlier matches, that agree with its cameras.
+
+    Attributes
+    ----------
+    inliers : float
+        Share of the inlier matches that are in pairs within 5 degrees in rotation.
+    pairs : float
+        Share of the pairs within 5 degrees in rotation.
+    directions : float
+        Share of the inlier matches that are in pairs whose direction is within three standard deviations; a degree for
+        what the lens model leaves is in them.
+    num_pairs : int
+        Pairs between images of the component that have a rotation of their own.
+    """
+
+    inliers: float
+    pairs: float
+    directions: float
+    num_pairs: int
+
+
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
     """Poses of all images of a graph, in the graph's order; rows of unsolved images hold NaN.
@@ -67,8 +90,14 @@ class PoseSolution:
     status : SolutionStatus
     message : str
         A sentence that says what happened and what to do.
+    converged : bool
+        Whether no iteration limit was reached.
     caveats : tuple of str
         Sentences on what could not be had in full.
+    agreement : tuple of Agreement
+        Of each component with its pairs.
+    in_doubt : (n,) bool array or None
+        Images that another arrangement, with which nearly as many matches agree, places otherwise; None without one.
     log : tuple of LogEntry
     """
 
@@ -83,9 +112,12 @@ class PoseSolution:
     image_verdicts: NDArray[np.str_]
     status: SolutionStatus
     message: str
+    converged: bool = True
     caveats: tuple[str, ...] = ()
     radial_terms: Array | None = None
     position_covariances: Array | None = None
     rotation_covariances: Array | None = None
     edge_residual_sigmas: Array | None = None
+    agreement: tuple[Agreement, ...] = ()
+    in_doubt: NDArray[np.bool_] | None = None
     log: tuple[LogEntry, ...] = field(default=())

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.edge_residuals import edge_residual_sigmas
+from colmap_vg.edge_residuals import edge_residual_sigmas, rotation_residuals
 from colmap_vg.edge_weights import edge_likelihoods, edge_weights
 from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
 from colmap_vg.epipolar.baseline_lengths import connects_all, length_links, positions_by_lengths, solve_lengths
@@ -37,8 +37,8 @@ from colmap_vg.positions.shapefit import solve_shapefit
 from colmap_vg.robust import geman_mcclure_weight
 from colmap_vg.rotations.certificate import certify_chordal
 from colmap_vg.rotations.chordal import average_rotations_chordal
-from colmap_vg.rotations.consensus import average_rotations_by_consensus
-from colmap_vg.rotations.robust import average_rotations_robust, rotation_residuals
+from colmap_vg.rotations.consensus import ConsensusRotations, average_rotations_by_consensus
+from colmap_vg.rotations.robust import average_rotations_robust
 from colmap_vg.solution import LogEntry, PoseSolution
 from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.view_graph import ViewGraph
@@ -62,6 +62,9 @@ share, a lens not quite as modelled, is in the median; noise of one pair does no
 TRUST_PER_MEDIAN, TRUST_SCALES_DEG = 20.0, (3.0, 10.0)
 """Geman-McClure scale of what a rotation's residual says of the direction, over the median residual, and its range. A
 false pair across a long street would otherwise fold it: it costs more displacement than tearing a street apart."""
+CLEAR_LEAD = 0.03
+"""Of the consensus over that of any other solution of the rotations. On graphs of objects that repeat themselves all
+folded solutions had a rival nearer than this, and nine in ten right ones had none."""
 TRIAL_SHARE = 0.25
 """Share of the rotation gate that pairs on trial must keep within: one false pair in 10^5 does, by chance."""
 
@@ -155,6 +158,7 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
                 options.random_seed,
             )
             rotations, log = found.cam_from_world_rotations, found.log
+            _doubt_rival(ledger, part, found)
         else:
             # The gate has only taken away what disagrees: the search is done.
             result = average_rotations_robust(
@@ -174,6 +178,21 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
         smaller = ledger.largest_component(images, ImageVerdict.CUT_OFF)
         part, start = smaller, rotations[part.rows_of(smaller.images)]
     return np.zeros((part.num_images, 3, 3)), part
+
+
+def _doubt_rival(ledger: Ledger, part: Subgraph, found: ConsensusRotations) -> None:
+    """Say where another solution of the rotations agrees with nearly as many matches."""
+    if found.consensus - found.rival_consensus >= CLEAR_LEAD:
+        return
+    images = part.images[found.rival_images]
+    names = ledger.graph.image_names or tuple(map(str, ledger.graph.image_ids.tolist()))
+    shown = ", ".join(names[i] for i in images[:5]) + (", ..." if len(images) > 5 else "")
+    ledger.doubt(
+        images,
+        f"Another arrangement of the images agrees with nearly as many matches ({found.rival_consensus:.3f} of them,"
+        f" this one with {found.consensus:.3f}): the scene may repeat itself, and the model may be folded. It places"
+        f" {len(images)} of {part.num_images} images otherwise ({shown}).",
+    )
 
 
 def _certify_rotations(

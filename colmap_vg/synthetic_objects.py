@@ -25,6 +25,8 @@ FALSE_SHARES = ((15, 0.84, 0.96), (30, 0.53, 0.90), (60, 0.25, 0.66), (120, 0.06
 MEDIAN_INLIERS, INLIER_SPREAD = 110.0, 1.1
 """Of the log-normal distribution of the numbers of inliers."""
 MIN_INLIERS = 15
+SIDE_INLIERS, SIDE_WIDTH = 600.0, np.radians(35.0)
+"""Matches of two views of one side from one place, and how they fall with the angle between them."""
 MAX_VIEW_ANGLE = np.radians(75.0)
 """Between the viewing directions of a true pair."""
 
@@ -124,6 +126,73 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
         edge_information=precisions[:, :, None] * np.eye(5),
     )
     return SyntheticScene(graph, R, p, np.arange(num_edges)[order] >= num_true)
+
+
+def symmetric_object_scene(
+    num_images: int, num_sides: int, unique_share: float = 0.3, noise: ObjectNoise | None = None, seed: int = 0
+) -> SyntheticScene:
+    """Viewing graph of cameras on one ring around an object with equal sides, on a ground that is not.
+
+    Each pair of images is matched as it would be if the object were turned by the number of sides that brings the two
+    views nearest; the ground has a say only where nothing is turned.
+
+    Parameters
+    ----------
+    num_images : int
+        8 or more.
+    num_sides : int
+        Equal sides, 2 or more.
+    unique_share : float
+        Matches on the ground over those on the object.
+    noise : ObjectNoise, optional
+        `hardness`, `coherent_share` and `focal_error` are not used.
+    seed : int
+
+    Returns
+    -------
+    SyntheticScene
+        `outlier` marks pairs matched across sides.
+
+    Raises
+    ------
+    OptionError
+        There are too few images or sides, or a share or noise is negative.
+    """
+    noise = noise or ObjectNoise()
+    if num_images < 8 or num_sides < 2 or unique_share < 0:
+        raise OptionError(
+            f"symmetric_object_scene: {num_images} images, {num_sides} sides and a unique share of {unique_share}; take"
+            " 8 images, 2 sides and a share of 0 or more"
+        )
+    rng = np.random.default_rng(seed)
+    turn = 2.0 * np.pi * np.arange(num_images) / num_images
+    p = 4.0 * np.stack([np.cos(turn), np.sin(turn), np.full(num_images, 0.3)], axis=1)
+    p += 0.05 * rng.standard_normal((num_images, 3))
+    R = look_at(p, 0.05 * rng.standard_normal((num_images, 3)))
+    i, j = np.triu_indices(num_images, 1)
+    side = 2.0 * np.pi * np.arange(num_sides) / num_sides
+    apart = (turn[j] - turn[i] + side[:, None] + np.pi) % (2.0 * np.pi) - np.pi
+    matches = SIDE_INLIERS * np.exp(-np.square(apart / SIDE_WIDTH) + 0.3 * rng.standard_normal(apart.shape))
+    matches[0] *= 1.0 + unique_share
+    best = matches.argmax(axis=0)
+    counts = np.round(matches.max(axis=0)).astype(np.int64)
+    seen = counts >= MIN_INLIERS
+    i, j, best, counts = i[seen], j[seen], best[seen], counts[seen]
+    turned = so3.exp(np.stack([np.zeros(len(side)), np.zeros(len(side)), side], axis=1))[best]
+    R_seen, p_seen = R[j] @ np.swapaxes(turned, 1, 2), np.einsum("kab,kb->ka", turned, p[j])
+    fewness = np.sqrt(MEDIAN_INLIERS / counts)
+    sigmas = [np.radians(noise.rotation_deg) * fewness, np.radians(noise.direction_deg) * fewness]
+    tilts = [so3.exp(s[:, None] * rng.standard_normal((len(i), 3))) for s in sigmas]
+    direction = np.einsum("kab,kbc,kc->ka", tilts[1], R[i], normalized(p_seen - p[i]))
+    graph = ViewGraph(
+        image_ids=np.arange(1, num_images + 1),
+        edges=np.stack([i, j], axis=1),
+        cam2_from_cam1_rotations=so3.project(tilts[0] @ R_seen @ np.swapaxes(R[i], 1, 2)),
+        cam2_in_cam1_directions=normalized(direction),
+        num_inliers=counts,
+        edge_information=(np.stack([sigmas[0]] * 3 + [sigmas[1]] * 2, axis=1) ** -2.0)[:, :, None] * np.eye(5),
+    )
+    return SyntheticScene(graph, R, p, best != 0)
 
 
 def _cameras(num_images: int, rng: np.random.Generator) -> tuple[Array, Array]:

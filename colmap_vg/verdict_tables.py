@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.agreement import MAX_ROTATION_DEG, pose_errors_deg
 from colmap_vg.errors import DataFileError, OutputError
-from colmap_vg.geometry.directions import normalized
-from colmap_vg.rotations.robust import rotation_residuals
 from colmap_vg.solution import PoseSolution
 from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.view_graph import ViewGraph
@@ -99,7 +98,9 @@ def verdict_tables(graph: ViewGraph, solution: PoseSolution, skipped: Mapping[st
         )
     ]
     images += [ImageRow(name, "", reason, 0, 0) for name, reason in (skipped or {}).items()]
-    rotation, direction = pose_errors_deg(graph, solution)
+    rotation, direction = pose_errors_deg(
+        graph, solution.cam_from_world_rotations, solution.projection_centers, solution.component
+    )
     inliers = [""] * graph.num_edges if graph.num_inliers is None else [str(k) for k in graph.num_inliers.tolist()]
     sigmas = solution.edge_residual_sigmas
     if sigmas is None:
@@ -130,21 +131,6 @@ def deviations(solution: PoseSolution) -> tuple[NDArray[np.float64], NDArray[np.
 def image_names(graph: ViewGraph) -> list[str]:
     """Names of a graph's images; their ids where it has none."""
     return list(graph.image_names or map(str, graph.image_ids.tolist()))
-
-
-def pose_errors_deg(graph: ViewGraph, solution: PoseSolution) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Angles (m,) between the edges' rotations and directions and those of the solution; NaN where there is none."""
-    i, j = graph.edges.T
-    same = (solution.component[i] >= 0) & (solution.component[i] == solution.component[j])
-    R, p = solution.cam_from_world_rotations, solution.projection_centers
-    rotation, direction = np.full((2, graph.num_edges), np.nan)
-    known = same & graph.has_rotation
-    rotation[known] = np.degrees(rotation_residuals(graph.edges[known], graph.cam2_from_cam1_rotations[known], R))
-    known = same & graph.has_direction
-    solved = normalized(np.einsum("kab,kb->ka", R[i[known]], p[j[known]] - p[i[known]]))
-    chord = np.linalg.norm(solved - graph.cam2_in_cam1_directions[known], axis=1)
-    direction[known] = np.degrees(2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0)))
-    return rotation, direction
 
 
 def bridges(graph: ViewGraph, solution: PoseSolution, num_shown: int = 10) -> list[dict[str, object]]:
@@ -234,7 +220,10 @@ def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
 def explain_job(tables: VerdictTables) -> list[str]:
     """Lines on all models, what was left out, and the pairs by verdict."""
     models = Counter(row.model for row in tables.images if row.model)
-    lines = [f"model {model}: {count} images" for model, count in sorted(models.items(), key=lambda m: int(m[0]))]
+    lines = [
+        f"model {model}: {count} images{_agreement(tables, model)}"
+        for model, count in sorted(models.items(), key=lambda m: int(m[0]))
+    ]
     left_out = [row for row in tables.images if not row.model]
     lines.append(f"left out: {len(left_out)} of {len(tables.images)} images")
     lines += [f"  {row.image}: {row.verdict} ({image_reason(row.verdict)})" for row in left_out]
@@ -307,6 +296,20 @@ def _image(tables: VerdictTables, name: str) -> ImageRow:
     near = get_close_matches(name, [row.image for row in tables.images], n=3, cutoff=0.4)
     hint = f"did you mean {', '.join(near)}?" if near else f"{IMAGES_NAME} lists them"
     raise DataFileError(f"no image {name!r} among the {len(tables.images)} of this job; {hint}")
+
+
+def _agreement(tables: VerdictTables, model: str) -> str:
+    """Clause on the pairs between a model's images that agree with it."""
+    inside = {row.image for row in tables.images if row.model == model}
+    pairs = [p for p in tables.pairs if p.rotation_error_deg and {p.image1, p.image2} <= inside]
+    if not pairs:
+        return ""
+    agreeing = [p for p in pairs if float(p.rotation_error_deg) <= MAX_ROTATION_DEG]
+    matches = sum(int(p.num_inliers or 1) for p in agreeing) / sum(int(p.num_inliers or 1) for p in pairs)
+    return (
+        f"; {matches:.1%} of the inlier matches and {len(agreeing)} of {len(pairs)} pairs agree with it within"
+        f" {MAX_ROTATION_DEG:g}°"
+    )
 
 
 def _described(pair: PairRow) -> str:

@@ -71,6 +71,8 @@ class SolutionStatus(StrEnum):
     SOLVED = "solved"
     PARTIAL = "partial"
     """Solved, but some images are not in the largest model."""
+    DOUBTFUL = "doubtful"
+    """Too many pairs contradict the model, or another arrangement of its images agrees with nearly as many matches."""
     NOT_CONVERGED = "not_converged"
     """The iteration limit was reached; the poses are the best found."""
     UNSOLVABLE = "unsolvable"

@@ -1,5 +1,6 @@
 """Photographs with known cameras: models from their databases, held against the truth."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,15 @@ import pycolmap
 import pytest
 
 import colmap_vg
-from colmap_vg import align_positions, read_view_graph, solve_view_graph, view_graph_mapping
+from colmap_vg import (
+    SolutionStatus,
+    SolveOptions,
+    ViewGraph,
+    align_positions,
+    read_view_graph,
+    solve_view_graph,
+    view_graph_mapping,
+)
 from colmap_vg.geometry import so3
 from colmap_vg.mapping.support import supported_observations
 from colmap_vg.two_view.essential import essential_from_pose, sampson_errors
@@ -61,6 +70,45 @@ def test_no_image_is_registered_that_few_points_fix(name: str, fewest: int, data
     support = supported_observations(model, min_angle_deg=1.5)
     assert len(support) >= fewest
     assert min(support.values()) >= 15
+
+
+def with_images_in_another_order(graph: ViewGraph, order: np.ndarray) -> ViewGraph:
+    """The graph with its images, and by them its edges, in another order."""
+    place = np.argsort(order)
+    assert graph.camera_idx is not None
+    return replace(
+        graph,
+        image_ids=graph.image_ids[order],
+        image_names=tuple(graph.image_names[i] for i in order),
+        camera_idx=graph.camera_idx[order],
+        edges=place[graph.edges],
+    )
+
+
+def test_an_object_half_of_whose_pairs_are_false(data_folder: Path) -> None:
+    # Averaging folded this set, whatever the weights of its edges but unit ones.
+    folder = data_folder / "databases" / "fox"
+    rows = [line.split() for line in (folder / "reference_positions.txt").read_text().splitlines() if line[0] != "#"]
+    truth = {row[0]: np.array(row[1:], dtype=float) for row in rows}
+    graph = read_view_graph(folder / "database.db")
+    cases = [(graph, seed) for seed in range(3)]
+    cases.append((with_images_in_another_order(graph, np.random.default_rng(0).permutation(graph.num_images)), 0))
+    for shuffled, seed in cases:
+        solution = solve_view_graph(shuffled, SolveOptions(random_seed=seed))
+        assert solution.status == SolutionStatus.SOLVED
+        assert solution.registered.all()
+        reference = np.array([truth[name] for name in shuffled.image_names])
+        errors, _ = align_positions(solution.projection_centers, reference)
+        spread = np.sqrt(np.mean(np.sum((reference - reference.mean(axis=0)) ** 2, axis=1)))
+        assert np.median(errors) <= 0.006 * spread
+        assert solution.agreement[0].inliers >= 0.87
+
+
+@pytest.mark.parametrize("name", [*GLOBAL_MAPPING_MM, "lund", "banana", "sceaux"])
+def test_photographs_with_few_false_pairs_are_not_doubted(name: str, data_folder: Path) -> None:
+    solution = solve_view_graph(read_view_graph(data_folder / "images" / name / "database.db"))
+    assert solution.status in (SolutionStatus.SOLVED, SolutionStatus.PARTIAL)
+    assert solution.agreement[0].inliers > 0.98
 
 
 def test_stored_poses_that_nobody_recovered_are_not_used(data_folder: Path) -> None:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.errors import OptionError
 from colmap_vg.geometry import so3
-from colmap_vg.rotations.robust import rotation_residuals
 from colmap_vg.synthetic_objects import FALSE_SHARES, ObjectNoise, object_scene
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from colmap_vg import EdgeVerdict, ImageVerdict, SolveOptions, solve_view_graph
+from colmap_vg.agreement import pose_errors_deg
 from colmap_vg.errors import DataFileError, OutputError
 from colmap_vg.geometry import so3
 from colmap_vg.synthetic import ring_scene
@@ -15,7 +16,6 @@ from colmap_vg.verdict_tables import (
     explain_image,
     explain_job,
     explain_pair,
-    pose_errors_deg,
     read_tables,
     verdict_tables,
     write_tables,
@@ -41,7 +41,9 @@ def solved():
 
 
 def test_errors_are_those_that_were_made(solved):
-    rotation, direction = pose_errors_deg(*solved)
+    rotation, direction = pose_errors_deg(
+        solved[0], solved[1].cam_from_world_rotations, solved[1].projection_centers, solved[1].component
+    )
     expected = np.zeros((2, len(rotation)))
     expected[0, 4], expected[1, 7] = 40.0, 50.0
     np.testing.assert_allclose([rotation, direction], expected, atol=1e-5)
@@ -67,7 +69,8 @@ def test_answers_name_verdict_and_reason(solved):
     graph, solution = solved
     tables = verdict_tables(graph, solution, {"broken.jpg": "the file is empty"})
     job = "\n".join(explain_job(tables))
-    assert "model 0: 10 images" in job
+    assert "model 0: 10 images; " in job
+    assert "of the inlier matches and " in job
     assert "broken.jpg: the file is empty" in job
     assert f"1 rotation_outlier ({EdgeVerdict.ROTATION_OUTLIER.reason})" in job
     i, j = (graph.image_names[row] for row in graph.edges[4])

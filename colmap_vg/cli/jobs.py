@@ -207,7 +207,10 @@ def _finish(
     """Write the summary of a mapping job, and say what came out."""
     content = job_summary(verb, asked, reporter)
     content |= _verdicts(mapped.graph, mapped.solution, output_path, skipped or {})
-    content["models"] = [model_summary(output_path / str(index), model) for index, model in mapped.models.items()]
+    content["models"] = [
+        model_summary(output_path / str(index), model) | {"agreement": plain(mapped.solution.agreement[index])}
+        for index, model in mapped.models.items()
+    ]
     write_summary(output_path, {**content, **(further or {})})
     for index, model in mapped.models.items():
         size = f"{model.num_reg_images()} of {mapped.graph.num_images} images, {model.num_points3D()} points"

@@ -46,11 +46,14 @@ class BuildResult:
         Ids of images that left because too few points fix them.
     misplaced : frozenset of int
         Ids of images that points would have placed where their pairs contradict it.
+    folded : bool
+        Whether parts are held together by points alone, against what all pairs between them tell.
     """
 
     added: frozenset[int]
     removed: frozenset[int]
     misplaced: frozenset[int] = frozenset()
+    folded: bool = False
 
 
 def build_model(
@@ -115,10 +118,10 @@ def build_model(
             again = _remove_unsupported(mapper)
             removed, added = removed | again, added - again
         log.result(f"{len(added)} images added, {len(removed)} removed")
-        _warn_of_folds(reconstruction, pairs, log)
+        folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
-    return BuildResult(frozenset(added), frozenset(removed), frozenset(misplaced))
+    return BuildResult(frozenset(added), frozenset(removed), frozenset(misplaced), folded)
 
 
 def adjust_once_more(
@@ -217,9 +220,10 @@ def _remove_misplaced(mapper: "pycolmap.IncrementalMapper", added: set[int], pai
     return misplaced
 
 
-def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotations | None, log: StageLog) -> None:
+def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotations | None, log: StageLog) -> bool:
+    """Warn of parts and images that their pairs contradict; whether there are such parts."""
     if pairs is None:
-        return
+        return False
     found = pair_agreement(reconstruction, pairs)
     for part in found.detached:
         names = sorted(reconstruction.image(i).name for i in part)
@@ -230,6 +234,7 @@ def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
     if found.contradicted:
         names = sorted(reconstruction.image(i).name for i in found.contradicted)
         log.warn(f"The pairs of {len(names)} images tell other rotations than the model (first: {names[0]}).")
+    return len(found.detached) > 0
 
 
 def _state(reconstruction: "pycolmap.Reconstruction") -> str:

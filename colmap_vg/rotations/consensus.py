@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.geometry import so3
 from colmap_vg.rotations.cycles import closing_shares
-from colmap_vg.rotations.robust import average_rotations_robust, rotation_residuals
+from colmap_vg.rotations.robust import average_rotations_robust
 from colmap_vg.rotations.spanning_tree import spanning_tree
 from colmap_vg.rotations.votes import rotations_by_votes
 from colmap_vg.solution import LogEntry

@@ -10,7 +10,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from colmap_vg.geometry import so3
 from colmap_vg.linear.reweighted import ReweightedLaplacian
 from colmap_vg.robust import geman_mcclure_weight
 from colmap_vg.rotations import quaternions
@@ -96,25 +95,6 @@ def average_rotations_robust(
         converged = loop.run(loss, max_num_iterations, tolerance)
     cost = loop.step(loss, relative_tolerance=1e-8)
     return RotationResult(quaternions.to_matrices(loop.absolute), cost, len(loop.log), converged, tuple(loop.log))
-
-
-def rotation_residuals(edges: IntArray, cam2_from_cam1_rotations: Array, cam_from_world_rotations: Array) -> Array:
-    """Angles between measured and solved relative rotations.
-
-    Parameters
-    ----------
-    edges : (m, 2) int array
-    cam2_from_cam1_rotations : (m, 3, 3) array
-    cam_from_world_rotations : (n, 3, 3) array
-
-    Returns
-    -------
-    (m,) array
-        ``angle(R_ij^T R_j R_i^T)``, radians in [0, pi].
-    """
-    R = cam_from_world_rotations
-    i, j = edges[:, 0], edges[:, 1]
-    return so3.angle(np.swapaxes(R[j], 1, 2) @ cam2_from_cam1_rotations @ R[i])
 
 
 Loss = Callable[[Array], tuple[Array, Array]]

@@ -283,6 +283,8 @@ def test_mapper_writes_a_model_and_a_summary(tmp_path: Path, database_path: Path
     content = summary(tmp_path)
     assert content["images"]["num_registered"] == 10
     assert content["edges"]["num_kept"] == 45
+    assert content["status"] == "solved"
+    assert content["models"][0]["agreement"] == {"inliers": 1.0, "pairs": 1.0, "directions": 1.0, "num_pairs": 45}
     named = " ".join(content["warnings"])
     for flag in ("--Mapper.max_num_models", "--GlobalMapper.gp_use_gpu", "--skip_pruning"):
         assert flag in named
