@@ -1,19 +1,23 @@
-"""Rotations with which most verified matches agree: several starts, the one of largest consensus, then precision.
+"""Rotations that most verified matches agree with: several starts, the one of largest consensus, then precision.
 
 Averaging with a robust loss finds the valley that it starts in. Where nearly half of the edges are false and agree
-among themselves, that valley is often a fold; what tells the right one is how many inlier matches agree with it.
-Numbers of inliers say how likely an edge is right, information says how precise it is if it is right: the first
-chooses, the second refines, inside the consensus that was chosen.
+among themselves, that valley is often a fold; what tells the right one is how many edges agree with it, each by the
+odds that it is right. These are learned: edges with more inliers are right more often, how much more depends on the
+scene. Information says how precise an edge is if it is right: it refines, inside the consensus that was chosen.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.geometry import so3
+from colmap_vg.rotations.alternatives import nearest_alternative
 from colmap_vg.rotations.cycles import closing_shares
+from colmap_vg.rotations.refinement import AGREEMENT_DEG, capped_likelihoods, refine_rotations
 from colmap_vg.rotations.robust import average_rotations_robust
 from colmap_vg.rotations.spanning_tree import spanning_tree
 from colmap_vg.rotations.votes import rotations_by_votes
@@ -23,23 +27,25 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-AGREEMENT_DEG = 5.0
-"""A pair within this of the averaged rotations agrees."""
 CLEAR_CONSENSUS = 0.97
-"""Share of agreeing matches from which on no other start is tried: on graphs of photographs it was above 0.98 wherever
-few pairs were false."""
-MAX_WEIGHT = 10.0
-"""Inliers of one edge, over the median edge's, that count at most: no single pair outvotes a group."""
-VOTE_CAPS = (4.0, 10.0, 1.0)
-"""Inliers over the median's that count at most in the votes of the first starts."""
-VOTES_PER_IMAGE = 20
-"""Edges of each image that vote, the heaviest; of weak ones most are false where many are."""
-NUM_RANDOM_STARTS, RANDOM_SPREAD, MAX_EDGES_OF_STARTS = 8, 0.5, 200_000
-"""Starts by votes whose weights are multiplied at random, log-normally; fewer where all starts' edges together would be
-more than that."""
+"""Consensus from which on no other start is tried: on graphs of photographs it was above 0.98 wherever few pairs were
+false."""
+SKELETON_EDGES = 6
+"""Edges of each image, its heaviest, by which a first candidate is chosen to learn from. What repeats makes many pairs,
+and weaker ones: of 100 graphs of objects that repeat themselves the consensus of all edges chose right in 90, that of
+the heaviest in 98; but it is a sample of the evidence only, and where likelihoods tell nothing, a poor one."""
+NUM_GROUPS = 10
+"""Of edges with like likelihoods, each as many, whose shares of agreement with the first candidate are learned."""
+VOTES = ((20, 4.0), (20, 10.0), (20, 1.0), (10, 4.0), (6, 4.0))
+"""Starts by votes: how many of each image's heaviest edges vote, and up to which likelihood over the median's."""
+RANDOM_VOTES, NUM_RANDOM_STARTS, RANDOM_SPREAD, MAX_EDGES_OF_STARTS = (20, 8), 8, 0.5, 60_000
+"""Starts by votes whose weights are multiplied at random, log-normally, in turn of so many edges an image; fewer where
+all starts' edges together would be more than the last number."""
+AVERAGED_EDGES = 40
+"""Edges of each image, its heaviest, by which candidates are averaged; the winner by all."""
 MIN_CLOSING_SHARE = 0.01
-MAX_LOSS = 0.002
-"""Of the consensus, that refining may cost: a few pairs at the very bound of agreement."""
+MAX_NUM_MOVED = 10
+"""Images that the nearest other solution may be away; on larger graphs random starts end in different folds."""
 NUM_ALIGNMENTS = 32
 SAME_DEG, SAME_SHARE = 15.0, 0.95
 """Two solutions are the same where so large a share of the images is turned by no more than this between them."""
@@ -52,10 +58,10 @@ class ConsensusRotations:
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
-    consensus : float
-        Share of the capped numbers of inliers in edges within `AGREEMENT_DEG`.
-    rival_consensus : float
-        The same of the best solution that is another one; 0 where none was found, or none was looked for.
+    lead : float
+        Over the nearest solution that is another one, as a share of the weight of the edges that agree with just one of
+        the two; by likelihoods or by learned odds, whichever is larger. 1 where there was no other, or none was looked
+        for.
     rival_images : (n,) bool array
         Images that the rival turns otherwise.
     log : tuple of LogEntry
@@ -63,8 +69,7 @@ class ConsensusRotations:
     """
 
     cam_from_world_rotations: Array
-    consensus: float
-    rival_consensus: float
+    lead: float
     rival_images: BoolArray
     log: tuple[LogEntry, ...]
 
@@ -98,69 +103,89 @@ def average_rotations_by_consensus(
     """
     search = _Search(num_images, edges, cam2_from_cam1_rotations, likelihoods)
     search.add(search.averaged(None, l1=True))
-    if search.best_consensus < CLEAR_CONSENSUS:
-        rng = np.random.default_rng(seed)
-        for cap in VOTE_CAPS:
-            search.add(search.averaged(search.votes(np.minimum(search.relative_weights, cap)), l1=False))
-        start = search.votes(np.minimum(search.relative_weights, VOTE_CAPS[0]) * search.closing_shares())
+    if not search.is_clear():
+        # On graphs of many edges the heaviest are enough to find the valley in.
+        search.average_by(AVERAGED_EDGES)
+        for per_image, cap in VOTES:
+            search.add(search.averaged(search.votes(per_image, cap), l1=False))
+        start = search.votes(*VOTES[0], search.closing_shares())
         search.add(search.averaged(start, l1=False))
         search.add(search.averaged(start, l1=True))
-        for _ in range(min(NUM_RANDOM_STARTS, MAX_EDGES_OF_STARTS // max(search.num_voting, 1))):
+        rng = np.random.default_rng(seed)
+        num_random = 0 if search.agree() else MAX_EDGES_OF_STARTS // (RANDOM_VOTES[0] * num_images)
+        for number in range(min(NUM_RANDOM_STARTS, num_random)):
             noise = np.exp(RANDOM_SPREAD * rng.standard_normal(len(edges)))
-            search.add(
-                search.averaged(search.votes(np.minimum(search.relative_weights, VOTE_CAPS[0]) * noise), l1=False)
-            )
-    best, consensus, rival, apart = search.ranked()
-    rotations, log = _refined(search, best, consensus, weights)
-    return ConsensusRotations(rotations, search.consensus(rotations), rival, apart, log)
+            per_image = RANDOM_VOTES[number % len(RANDOM_VOTES)]
+            search.add(search.averaged(search.votes(per_image, VOTES[0][1], noise), l1=False))
+        search.average_by(None)
+        search.add(search.averaged(search.ranked()[0], l1=False))
+        search.add_alternative(search.ranked()[0])
+    best, lead, apart = search.ranked()
+    rotations, log = refine_rotations(num_images, edges, cam2_from_cam1_rotations, likelihoods, weights, best)
+    return ConsensusRotations(rotations, lead, apart, log)
 
 
 class _Search:
-    """Candidates and their consensus."""
+    """Candidates and the edges that agree with each."""
 
     def __init__(self, num_images: int, edges: IntArray, relative: Array, likelihoods: Array) -> None:
         self.num_images, self.edges, self.relative = num_images, edges, relative
-        self.relative_weights = likelihoods / np.median(likelihoods)
-        self.capped = np.minimum(self.relative_weights, MAX_WEIGHT)
-        self._voting = _heaviest(num_images, edges, likelihoods, VOTES_PER_IMAGE)
-        self.num_voting = int(self._voting.sum())
+        self._likelihoods = likelihoods / np.median(likelihoods)
+        self._capped = capped_likelihoods(likelihoods)
+        self._heaviest = cache(self._find_heaviest)
+        self._skeleton = self._heaviest(SKELETON_EDGES)
+        self._averaged = np.ones(len(edges), dtype=bool)
         self._candidates: list[Array] = []
-        self._consensus: list[float] = []
-
-    @property
-    def best_consensus(self) -> float:
-        """Largest consensus so far."""
-        return max(self._consensus)
+        self._agree: list[BoolArray] = []
 
     def add(self, rotations: Array) -> None:
         """Take a candidate in."""
+        residuals = rotation_residuals(self.edges, self.relative, rotations)
         self._candidates.append(rotations)
-        self._consensus.append(self.consensus(rotations))
+        self._agree.append(residuals <= np.radians(AGREEMENT_DEG))
 
-    def consensus(self, rotations: Array) -> float:
-        """Share of the capped weights in edges that agree with rotations."""
-        agree = rotation_residuals(self.edges, self.relative, rotations) <= np.radians(AGREEMENT_DEG)
-        return float(self.capped @ agree / self.capped.sum())
+    def add_alternative(self, rotations: Array) -> None:
+        """Take in the nearest other solution, where it is few images away."""
+        num_moved = int((1.0 - SAME_SHARE) * self.num_images) + 1
+        if num_moved <= MAX_NUM_MOVED:
+            problem = self.num_images, self.edges, self.relative, self._capped
+            self.add(nearest_alternative(*problem, rotations, num_moved))
 
-    def votes(self, weights: Array) -> Array:
-        """Rotations by the votes of each image's heaviest edges."""
-        among = weights[self._voting]
-        return rotations_by_votes(self.num_images, self.edges[self._voting], self.relative[self._voting], among)
+    def average_by(self, per_image: int | None) -> None:
+        """Average candidates from now on by each image's heaviest edges, or by all."""
+        self._averaged = np.ones(len(self.edges), dtype=bool) if per_image is None else self._heaviest(per_image)
+
+    def agree(self) -> bool:
+        """Whether all candidates but the first are one solution."""
+        turned = [_turned(self._candidates[1], other) > np.radians(SAME_DEG) for other in self._candidates[2:]]
+        return all(apart.mean() <= 1.0 - SAME_SHARE for apart in turned)
+
+    def is_clear(self) -> bool:
+        """Whether the first candidate needs no other: nearly all of its edges agree, the heaviest too."""
+        shares = [
+            self._capped[among] @ self._agree[0][among] / self._capped[among].sum() for among in (self._skeleton, ...)
+        ]
+        return bool(min(shares) >= CLEAR_CONSENSUS)
+
+    def votes(self, per_image: int, cap: float, factors: Array | float = 1.0) -> Array:
+        """Rotations by votes of each image's heaviest edges, their capped likelihoods times factors."""
+        voting = self._heaviest(per_image)
+        weights = (np.minimum(self._likelihoods, cap) * factors)[voting]
+        return rotations_by_votes(self.num_images, self.edges[voting], self.relative[voting], weights)
 
     def closing_shares(self) -> Array:
-        """Of the triangles of voting edges, above zero; for edges that do not vote 1."""
-        among = self._voting
-        shares = np.ones(len(self.edges))
-        shares[among] = closing_shares(self.num_images, self.edges[among], self.relative[among], self.capped[among])
+        """Of the triangles of edges that vote, above zero; of the others 1."""
+        among, shares = self._heaviest(VOTES[0][0]), np.ones(len(self.edges))
+        shares[among] = closing_shares(self.num_images, self.edges[among], self.relative[among], self._capped[among])
         return np.maximum(shares, MIN_CLOSING_SHARE)
 
     def averaged(self, start: Array | None, *, l1: bool) -> Array:
-        """Rotations averaged by the capped weights from a start, or from the spanning tree."""
+        """Rotations averaged by the capped likelihoods from a start, or from the spanning tree."""
         return average_rotations_robust(
             self.num_images,
-            self.edges,
-            self.relative,
-            self.capped,
+            self.edges[self._averaged],
+            self.relative[self._averaged],
+            self._capped[self._averaged],
             start,
             sigma_deg=AGREEMENT_DEG,
             adapt_sigma=False,
@@ -168,48 +193,66 @@ class _Search:
             tolerance=1e-3,
         ).cam_from_world_rotations
 
-    def ranked(self) -> tuple[Array, float, float, BoolArray]:
-        """The best candidate, its consensus, that of the best other solution, and where that one differs."""
-        order = np.argsort(-np.asarray(self._consensus), kind="stable")
-        best = self._candidates[order[0]]
-        for other in order[1:]:
-            apart = _turned(best, self._candidates[other]) > np.radians(SAME_DEG)
-            if apart.mean() > 1.0 - SAME_SHARE:
-                return best, self._consensus[order[0]], self._consensus[other], apart
-        return best, self._consensus[order[0]], 0.0, np.zeros(self.num_images, dtype=bool)
+    def ranked(self) -> tuple[Array, float, BoolArray]:
+        """The best candidate, its lead over the nearest other solution, and images where that one differs."""
+        agree = np.array(self._agree, dtype=np.float64)
+        of_all = agree @ self._capped / self._capped.sum()
+        skeleton = np.where(self._skeleton, self._capped, 0.0)
+        first = int(np.argmax(agree @ skeleton))
+        odds = learned_log_odds(self._likelihoods, self._agree[first])
+        by_odds = agree @ odds / odds.sum() if odds.any() else of_all
+        winner = int(np.lexsort((-of_all, -by_odds))[0])
+        best, lead, apart = self._candidates[winner], 1.0, np.zeros(self.num_images, dtype=bool)
+        for row, other in enumerate(self._candidates):
+            ahead = max(_lead(weights, agree[winner], agree[row]) for weights in (self._capped, odds))
+            if ahead < lead:
+                turned = _turned(best, other) > np.radians(SAME_DEG)
+                if turned.mean() > 1.0 - SAME_SHARE:
+                    lead, apart = ahead, turned
+        return best, lead, apart
+
+    def _find_heaviest(self, count: int) -> BoolArray:
+        """Edges (m,) that are among the heaviest of one of their images, and those that join what these leave apart.
+
+        All edges where they weigh the same.
+        """
+        weights, num_edges = self._likelihoods, len(self.edges)
+        if np.ptp(weights) == 0:
+            return np.ones(num_edges, dtype=bool)
+        ends, rows = self.edges.T.ravel(), np.tile(np.arange(num_edges), 2)
+        order = np.lexsort((rows, -weights[rows], ends))
+        rank = np.arange(len(order)) - np.searchsorted(ends[order], np.arange(self.num_images))[ends[order]]
+        chosen = np.zeros(num_edges, dtype=bool)
+        chosen[rows[order[rank < count]]] = True
+        _, tree, _ = spanning_tree(self.num_images, self.edges, weights)
+        chosen[tree[tree >= 0]] = True
+        return chosen
 
 
-def _refined(search: _Search, rotations: Array, consensus: float, weights: Array) -> tuple[Array, tuple[LogEntry, ...]]:
-    """The rotations after averaging by precision inside their consensus, unless that lowers it."""
-    residuals = rotation_residuals(search.edges, search.relative, rotations)
-    # The others keep just enough to leave nothing unconnected.
-    inside = np.where(residuals <= np.radians(2.0 * AGREEMENT_DEG), weights, 1e-6 * np.median(weights))
-    for adapt_sigma in (True, False):
-        result = average_rotations_robust(
-            search.num_images,
-            search.edges,
-            search.relative,
-            inside,
-            rotations,
-            sigma_deg=AGREEMENT_DEG,
-            adapt_sigma=adapt_sigma,
-            max_num_l1_iterations=0,
-        )
-        if search.consensus(result.cam_from_world_rotations) >= consensus - MAX_LOSS:
-            return result.cam_from_world_rotations, result.log
-    return rotations, result.log
+def _lead(weights: Array, agree: Array, other: Array) -> float:
+    """Lead of one solution over another, as a share of the weight that agrees with just one of them."""
+    contested = float(weights @ np.abs(agree - other))
+    return float(weights @ (agree - other)) / contested if contested > 0 else 0.0
 
 
-def _heaviest(num_images: int, edges: IntArray, weights: Array, count: int) -> BoolArray:
-    """Edges (m,) that are among the heaviest of one of their images, and those that join what these leave apart."""
-    ends, rows = edges.T.ravel(), np.tile(np.arange(len(edges)), 2)
-    order = np.lexsort((rows, -weights[rows], ends))
-    rank = np.arange(len(order)) - np.searchsorted(ends[order], np.arange(num_images))[ends[order]]
-    chosen = np.zeros(len(edges), dtype=bool)
-    chosen[rows[order[rank < count]]] = True
-    _, tree, _ = spanning_tree(num_images, edges, weights)
-    chosen[tree[tree >= 0]] = True
-    return chosen
+def learned_log_odds(likelihoods: Array, agree: BoolArray) -> Array:
+    """Log odds that an edge is right, by the share that agrees with a candidate among edges of like likelihood.
+
+    Parameters
+    ----------
+    likelihoods : (m,) array
+    agree : (m,) bool array
+
+    Returns
+    -------
+    (m,) array
+        Never falling with the likelihood, and 0 where less than half agree.
+    """
+    place = np.searchsorted(np.sort(likelihoods), likelihoods)  # equal likelihoods go together
+    group = np.minimum(NUM_GROUPS * place // max(len(place), 1), NUM_GROUPS - 1)
+    total, right = np.bincount(group, minlength=NUM_GROUPS), np.bincount(group, agree, NUM_GROUPS)
+    share = isotonic_regression((right + 0.5) / (total + 1.0), weights=np.maximum(total, 1e-9)).x[group]
+    return np.asarray(np.maximum(np.log(share / (1.0 - share)), 0.0))
 
 
 def _turned(one: Array, other: Array) -> Array:

@@ -138,35 +138,47 @@ class _Clusters:
         )
         second = np.array([self._clusters_of[vote][1] for vote in votes])
         turn[:3] *= np.where(self._cluster[j] == second[run], 1.0, -1.0)
-        self._turn[:, votes], self._lead[votes] = _count(turn, w, sizes)
+        self._turn[:, votes], support, rival = count_votes(turn, w, sizes)
+        self._lead[votes] = support - rival
         self._fresh[votes] = True
 
 
-def _count(turn: Array, weights: Array, sizes: IntArray) -> tuple[Array, Array]:
-    """The turn that most weight wants and its lead over the strongest other one, for runs of edges of given sizes.
+def count_votes(turn: Array, weights: Array, sizes: IntArray) -> tuple[Array, Array, Array]:
+    """Turns that most weight wants, in runs of votes.
 
-    Each run begins with its heaviest edges.
+    Parameters
+    ----------
+    turn : (4, m) array
+        Quaternions voted for. The first ones of each run, its heaviest, are the hypotheses.
+    weights : (m,) array
+    sizes : (k,) int array
+        Votes of each run.
+
+    Returns
+    -------
+    winner : (4, k) array
+        Mean of the turns that agree with the winning hypothesis.
+    support, rival : (k,) array
+        Weight that agrees with the winner, and with the strongest hypothesis that does not.
     """
-    k = len(sizes)
-    starts, run = np.cumsum(sizes) - sizes, np.repeat(np.arange(k), sizes)
-    support = np.full((min(NUM_HYPOTHESES, int(sizes.max())), k), -1.0)
-    for h, row in enumerate(support):
-        voters = np.flatnonzero(sizes[run] > h)
-        of = run[voters]
-        agree = _agree(turn[:, voters], turn[:, starts[of] + h])
-        row[sizes > h] = np.bincount(of, weights[voters] * agree, minlength=k)[sizes > h]
-    best = support.argmax(axis=0)
-    winner, lead = turn[:, starts + best], support.max(axis=0)
-    rival = np.zeros(k)
-    for h, row in enumerate(support):
-        put = np.flatnonzero(sizes > h)
-        apart = put[~_agree(turn[:, starts[put] + h], winner[:, put])]
-        rival[apart] = np.maximum(rival[apart], row[apart])
+    starts, run = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
+    # Short runs put their last edge's turn more than once, which changes nothing.
+    put = np.minimum(np.arange(min(NUM_HYPOTHESES, int(sizes.max()))), sizes[:, None] - 1) + starts[:, None]
+    hypotheses = turn[:, put]
+    agree = agree_within(turn[:, :, None], hypotheses[:, run])
+    support = np.add.reduceat(weights[:, None] * agree, starts, axis=0)
+    best = (np.arange(len(sizes)), support.argmax(axis=1))
+    winner = hypotheses[:, best[0], best[1]]
+    rival = np.where(agree_within(hypotheses, winner[:, :, None]), 0.0, support).max(axis=1)
+    for_winner = agree[np.arange(len(run)), best[1][run]]
     cosine = np.einsum("ck,ck->k", turn, winner[:, run])
-    counted = np.where(_agree(turn, winner[:, run]), np.copysign(weights, cosine), 0.0)
-    mean = np.stack([np.bincount(run, counted * component, minlength=k) for component in turn])
-    return mean / np.linalg.norm(mean, axis=0), lead - rival
+    counted = np.where(for_winner, np.copysign(weights, cosine), 0.0)
+    mean = np.add.reduceat(counted * turn, starts, axis=1)
+    length = np.linalg.norm(mean, axis=0)
+    return np.where(length > 0, mean / np.where(length > 0, length, 1.0), winner), support[best], rival
 
 
-def _agree(one: Array, other: Array) -> BoolArray:
-    return np.asarray(np.abs(np.einsum("ck,ck->k", one, other)) > np.cos(np.radians(0.5 * AGREEMENT_DEG)))
+def agree_within(one: Array, other: Array) -> BoolArray:
+    """Whether rotations, quaternions along the first axis, are within `AGREEMENT_DEG` of each other."""
+    cosine = one[0] * other[0] + one[1] * other[1] + one[2] * other[2] + one[3] * other[3]
+    return np.asarray(np.abs(cosine) > np.cos(np.radians(0.5 * AGREEMENT_DEG)))
