@@ -52,6 +52,7 @@ class Ledger:
         self._converged = True
         self._covariances: Array | None = None
         self._in_doubt: BoolArray | None = None
+        self._rivals: list[Array] = []
 
     @property
     def usable(self) -> BoolArray:
@@ -71,8 +72,14 @@ class Ledger:
         """Take dropped edges back."""
         self.edge_verdicts[edge_rows] = EdgeVerdict.KEPT
 
+    def note_rivals(self, part: Subgraph, rivals: tuple[Array, ...]) -> None:
+        """Note other rotations (k, 3, 3) of a part."""
+        for rotations in rivals:
+            self._rivals.append(np.full((self.graph.num_images, 3, 3), np.nan))
+            self._rivals[-1][part.images] = rotations
+
     def doubt(self, images: IntArray, told: str) -> None:
-        """Note images whose place is in doubt, and the sentence that tells why."""
+        """Note images whose place is in doubt, and why, in a sentence."""
         if self._in_doubt is None:
             self._in_doubt = np.zeros(self.graph.num_images, dtype=bool)
         self._in_doubt[images] = True
@@ -190,6 +197,7 @@ class Ledger:
             edge_residual_sigmas=self._edge_residual_sigmas(inside),
             agreement=agreement,
             in_doubt=self._in_doubt if in_doubt else None,
+            rivals=tuple(self._rivals),
             log=tuple(self.log),
         )
 

@@ -26,7 +26,8 @@ from colmap_vg.mapping.build import (
     extract_colors,
 )
 from colmap_vg.mapping.pair_agreement import PairRotations
-from colmap_vg.options import MappingOptions
+from colmap_vg.mapping.second_opinion import PointEvidence, point_evidence
+from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
 from colmap_vg.solve import solve_view_graph
@@ -37,6 +38,10 @@ from colmap_vg.view_graph import ViewGraph
 SAME_LENS_COST = 0.8
 """Share of its cost that bundle adjustment must leave when cameras that shared a calibration get their own: 0.98 to
 0.99 was left where there was one lens and images were strong, 0.89 where they were weak."""
+CLEARLY_MORE, MIN_SHARE_EXPLAINED = 1.2, 0.8
+"""Share of what should be seen that is, over that in another arrangement of the images, which settles between them: 1.5
+to 2.5 where one was folded and part of the scene did not repeat itself, 1.0 between two folds. An arrangement whose
+points explain much fewer observations than another's does not count."""
 FALSE_PAIRS = (EdgeVerdict.EXCLUDED, EdgeVerdict.ROTATION_OUTLIER)
 """Pairs whose matches are kept out of the points: a rotation that far off is not one of noise."""
 
@@ -128,6 +133,8 @@ def map_database(
         solution = _solve(graph, options, log)
         if not solution.registered.any():
             raise MappingError(f"{database_path}: {solution.message}")
+        if solution.rivals and graph.has_inliers and options.solve.method == "epipolar":
+            solution = _second_opinion(database_path, work, graph, solution, options, log)
         built = _build(database_path, work, graph, solution, options, log)
         if not built:
             raise MappingError(
@@ -167,8 +174,7 @@ def _build(
     """Models of all components that the points support, the one with most images first."""
     refined = options.ba_refine_focal_length or options.ba_refine_principal_point or options.ba_refine_extra_params
     shared = shared_cameras(graph) if options.share_cameras and refined else []
-    false = np.isin(solution.edge_verdicts, FALSE_PAIRS)
-    without = [(int(a), int(b)) for a, b in graph.image_ids[graph.edges[false]]]
+    without = _false_pairs(graph, solution)
     with log.stage("load"):
         with loaded_cache(database_path, work, options.read.min_num_inliers, shared, without) as (cache, replaced):
             components = range(int(solution.component.max(initial=-1)) + 1)
@@ -196,6 +202,56 @@ def _build(
     return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
 
 
+def _second_opinion(
+    database_path: str | PathLike[str],
+    work: Path,
+    graph: ViewGraph,
+    solution: PoseSolution,
+    options: MappingOptions,
+    log: StageLog,
+) -> PoseSolution:
+    """Of a solution and other arrangements of its images, the one in whose images most is seen of what should be."""
+    with log.stage("second opinion"):
+        others = [solve_view_graph(graph, _solve_options(options), rotations) for rotations in solution.rivals]
+        candidates = [solution, *others]
+        found = [_point_evidence(database_path, work, graph, candidate, options) for candidate in candidates]
+        shown = ", ".join(f"{evidence.share_seen:.2f}" for evidence in found)
+        log.result(f"of the points that images should see, so large a share is seen in each arrangement: {shown}")
+        most = max(evidence.num_observations for evidence in found)
+        shares = [e.share_seen if e.num_observations >= MIN_SHARE_EXPLAINED * most else 0.0 for e in found]
+        best = int(np.argmax(shares))
+        if shares[best] < CLEARLY_MORE * shares[0]:
+            best = 0
+        settled = all(shares[best] >= CLEARLY_MORE * share for k, share in enumerate(shares) if k != best)
+        chosen, in_doubt = candidates[best], None if settled else solution.in_doubt
+        if best > 0:
+            log.warn(
+                "Pairs agree with another arrangement of the images more, but there images do not see what they should:"
+                f" {shares[best]:.2f} of it is seen in the arrangement that is used, {shares[0]:.2f} in the other."
+            )
+        elif settled and solution.in_doubt is not None:
+            log.warn(
+                f"The points settle between them: this arrangement's images see {shares[0]:.2f} of what they should."
+            )
+        status, message = described(chosen.image_verdicts, chosen.converged, chosen.agreement, in_doubt is not None)
+        return replace(chosen, in_doubt=in_doubt, status=status, message=message)
+
+
+def _point_evidence(
+    database_path: str | PathLike[str], work: Path, graph: ViewGraph, solution: PoseSolution, options: MappingOptions
+) -> PointEvidence:
+    with loaded_cache(
+        database_path, work, options.read.min_num_inliers, without_pairs=_false_pairs(graph, solution)
+    ) as (cache, _):
+        return point_evidence(cache, reconstruction_from_solution(cache, solution, graph, 0), options)
+
+
+def _false_pairs(graph: ViewGraph, solution: PoseSolution) -> list[tuple[int, int]]:
+    """Image ids of pairs whose matches are kept out of the points."""
+    false = np.isin(solution.edge_verdicts, FALSE_PAIRS)
+    return [(int(a), int(b)) for a, b in graph.image_ids[graph.edges[false]]]
+
+
 def _pair_rotations(graph: ViewGraph) -> PairRotations:
     """Of pairs whose matches have a pose of their own, whatever the solver thought of it."""
     posed = graph.has_direction
@@ -215,14 +271,16 @@ def _read(database_path: str | PathLike[str], options: MappingOptions, log: Stag
 
 def _solve(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:
     with log.stage("solve"):
-        solve = replace(options.solve, random_seed=options.random_seed)
-        if not options.ba_refine_focal_length:
-            solve = replace(solve, refine_focal_lengths="never")
-        solution = solve_view_graph(graph, solve)
+        solution = solve_view_graph(graph, _solve_options(options))
         for caveat in solution.caveats:
             log.warn(caveat)
         log.result(solution.message)
     return solution
+
+
+def _solve_options(options: MappingOptions) -> SolveOptions:
+    solve = replace(options.solve, random_seed=options.random_seed)
+    return solve if options.ba_refine_focal_length else replace(solve, refine_focal_lengths="never")
 
 
 def _on_own_cameras(

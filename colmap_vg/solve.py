@@ -8,7 +8,7 @@ adjustment behind them. Each step works on the part of the graph that is still s
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from colmap_vg.edge_residuals import edge_residual_sigmas, rotation_residuals
 from colmap_vg.edge_weights import edge_likelihoods, edge_weights
@@ -80,13 +80,18 @@ _BASELINES = {
 
 
 @single_threaded_blas
-def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> PoseSolution:
+def solve_view_graph(
+    graph: ViewGraph, options: SolveOptions | None = None, initial_rotations: ArrayLike | None = None
+) -> PoseSolution:
     """Solve all rotations and positions of a viewing graph's parallel-rigid parts of three images or more.
 
     Parameters
     ----------
     graph : ViewGraph
     options : SolveOptions, optional
+    initial_rotations : (n, 3, 3) array, optional
+        cam_from_world rotations that averaging refines in place of searching for them. Where they are not finite for
+        all images of a part, that part is searched. Robust averaging only.
 
     Returns
     -------
@@ -96,13 +101,14 @@ def solve_view_graph(graph: ViewGraph, options: SolveOptions | None = None) -> P
     """
     options = options or SolveOptions()
     ledger = Ledger(graph)
+    initial = _initial_rotations(graph, initial_rotations)
     unsolved = np.ones(graph.num_images, dtype=bool)
     while True:
         part = ledger.largest_component(unsolved, ImageVerdict.SMALLER_COMPONENT)
         if part.num_images < MIN_COMPONENT_IMAGES:
             ledger.leave_out(part, ImageVerdict.SMALLER_COMPONENT)
             return ledger.solution()
-        rotations, gated = _average_rotations(ledger, part, options)
+        rotations, gated = _average_rotations(ledger, part, options, initial[part.images])
         gated = _admit_trials(ledger, gated, rotations, options)
         rigid = _filter_directions(ledger, gated, rotations, options)
         if rigid.num_images < MIN_COMPONENT_IMAGES:
@@ -140,9 +146,20 @@ class _Poses:
     radial_terms: Array | None = None
 
 
-def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) -> tuple[Array, Subgraph]:
+def _initial_rotations(graph: ViewGraph, given: ArrayLike | None) -> Array:
+    """Given rotations as an array; NaN where none are."""
+    shape = (graph.num_images, 3, 3)
+    if given is None:
+        return np.full(shape, np.nan)
+    rotations = np.asarray(given, dtype=np.float64)
+    if rotations.shape != shape:
+        raise GraphError(f"solve_view_graph: initial_rotations have shape {rotations.shape}, expected {shape}")
+    return rotations
+
+
+def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions, initial: Array) -> tuple[Array, Subgraph]:
     """Rotations of the part's images, and the part that the rotation gate leaves; gated until no edge goes."""
-    graph, start = ledger.graph, None
+    graph, start = ledger.graph, initial if np.isfinite(initial).all() else None
     while part.num_images >= 2:
         relative = graph.cam2_from_cam1_rotations[part.edge_rows]
         weights = edge_weights(graph, part.edge_rows, options)
@@ -161,7 +178,7 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
             rotations, log = found.cam_from_world_rotations, found.log
             _doubt_rival(ledger, part, found)
         else:
-            # The gate has only taken away what disagrees: the search is done.
+            # They were given, or found: the gate has only taken away what disagrees.
             likelihoods = edge_likelihoods(graph, part.edge_rows)
             rotations, log = refine_rotations(part.num_images, part.edges, relative, likelihoods, weights, start)
         bad = rotation_residuals(part.edges, relative, rotations) > np.radians(options.rotation_gate_deg)
@@ -180,7 +197,8 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions) ->
 
 
 def _doubt_rival(ledger: Ledger, part: Subgraph, found: ConsensusRotations) -> None:
-    """Say where another solution of the rotations agrees with nearly as many matches."""
+    """Note other solutions of the rotations, and say where one agrees with nearly as many matches."""
+    ledger.note_rivals(part, found.rivals)
     if found.lead >= CLEAR_LEAD:
         return
     images = part.images[found.rival_images]

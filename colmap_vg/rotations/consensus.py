@@ -34,6 +34,7 @@ SKELETON_EDGES = 6
 """Edges of each image, its heaviest, by which a first candidate is chosen to learn from. What repeats makes many pairs,
 and weaker ones: of 100 graphs of objects that repeat themselves the consensus of all edges chose right in 90, that of
 the heaviest in 98; but it is a sample of the evidence only, and where likelihoods tell nothing, a poor one."""
+BACKBONE_EDGES = 2
 NUM_GROUPS = 10
 """Of edges with like likelihoods, each as many, whose shares of agreement with the first candidate are learned."""
 VOTES = ((20, 4.0), (20, 10.0), (20, 1.0), (10, 4.0), (6, 4.0))
@@ -63,7 +64,9 @@ class ConsensusRotations:
         the two; by likelihoods or by learned odds, whichever is larger. 1 where there was no other, or none was looked
         for.
     rival_images : (n,) bool array
-        Images that the rival turns otherwise.
+        Images that the nearest other solution turns otherwise.
+    rivals : tuple of (n, 3, 3) arrays
+        That solution, and the one that each image's two heaviest edges make, where these are others than the winner.
     log : tuple of LogEntry
         Of the averaging that refined the winner.
     """
@@ -71,6 +74,7 @@ class ConsensusRotations:
     cam_from_world_rotations: Array
     lead: float
     rival_images: BoolArray
+    rivals: tuple[Array, ...]
     log: tuple[LogEntry, ...]
 
 
@@ -108,6 +112,7 @@ def average_rotations_by_consensus(
         search.average_by(AVERAGED_EDGES)
         for per_image, cap in VOTES:
             search.add(search.averaged(search.votes(per_image, cap), l1=False))
+        search.add_backbone()
         start = search.votes(*VOTES[0], search.closing_shares())
         search.add(search.averaged(start, l1=False))
         search.add(search.averaged(start, l1=True))
@@ -120,9 +125,9 @@ def average_rotations_by_consensus(
         search.average_by(None)
         search.add(search.averaged(search.ranked()[0], l1=False))
         search.add_alternative(search.ranked()[0])
-    best, lead, apart = search.ranked()
+    best, lead, apart, rivals = search.ranked()
     rotations, log = refine_rotations(num_images, edges, cam2_from_cam1_rotations, likelihoods, weights, best)
-    return ConsensusRotations(rotations, lead, apart, log)
+    return ConsensusRotations(rotations, lead, apart, rivals, log)
 
 
 class _Search:
@@ -135,6 +140,7 @@ class _Search:
         self._heaviest = cache(self._find_heaviest)
         self._skeleton = self._heaviest(SKELETON_EDGES)
         self._averaged = np.ones(len(edges), dtype=bool)
+        self._backbone: Array | None = None
         self._candidates: list[Array] = []
         self._agree: list[BoolArray] = []
 
@@ -143,6 +149,14 @@ class _Search:
         residuals = rotation_residuals(self.edges, self.relative, rotations)
         self._candidates.append(rotations)
         self._agree.append(residuals <= np.radians(AGREEMENT_DEG))
+
+    def add_backbone(self) -> None:
+        """Take in the solution that each image's two heaviest edges make.
+
+        What repeats matches many pairs; pairs of neighbours, who see what does not repeat as well, match best.
+        """
+        self._backbone = self.averaged(self.votes(BACKBONE_EDGES, np.inf), l1=False)
+        self.add(self._backbone)
 
     def add_alternative(self, rotations: Array) -> None:
         """Take in the nearest other solution, where it is few images away."""
@@ -157,8 +171,7 @@ class _Search:
 
     def agree(self) -> bool:
         """Whether all candidates but the first are one solution."""
-        turned = [_turned(self._candidates[1], other) > np.radians(SAME_DEG) for other in self._candidates[2:]]
-        return all(apart.mean() <= 1.0 - SAME_SHARE for apart in turned)
+        return not any(_differ(self._candidates[1], other) for other in self._candidates[2:])
 
     def is_clear(self) -> bool:
         """Whether the first candidate needs no other: nearly all of its edges agree, the heaviest too."""
@@ -193,8 +206,8 @@ class _Search:
             tolerance=1e-3,
         ).cam_from_world_rotations
 
-    def ranked(self) -> tuple[Array, float, BoolArray]:
-        """The best candidate, its lead over the nearest other solution, and images where that one differs."""
+    def ranked(self) -> tuple[Array, float, BoolArray, tuple[Array, ...]]:
+        """The best candidate, its lead over the nearest other solution, where that one differs, and its rivals."""
         agree = np.array(self._agree, dtype=np.float64)
         of_all = agree @ self._capped / self._capped.sum()
         skeleton = np.where(self._skeleton, self._capped, 0.0)
@@ -203,13 +216,16 @@ class _Search:
         by_odds = agree @ odds / odds.sum() if odds.any() else of_all
         winner = int(np.lexsort((-of_all, -by_odds))[0])
         best, lead, apart = self._candidates[winner], 1.0, np.zeros(self.num_images, dtype=bool)
+        rivals: tuple[Array, ...] = ()
         for row, other in enumerate(self._candidates):
             ahead = max(_lead(weights, agree[winner], agree[row]) for weights in (self._capped, odds))
             if ahead < lead:
                 turned = _turned(best, other) > np.radians(SAME_DEG)
                 if turned.mean() > 1.0 - SAME_SHARE:
-                    lead, apart = ahead, turned
-        return best, lead, apart
+                    lead, apart, rivals = ahead, turned, (other,)
+        if self._backbone is not None and all(_differ(self._backbone, other) for other in (best, *rivals)):
+            rivals += (self._backbone,)
+        return best, lead, apart, rivals
 
     def _find_heaviest(self, count: int) -> BoolArray:
         """Edges (m,) that are among the heaviest of one of their images, and those that join what these leave apart.
@@ -253,6 +269,11 @@ def learned_log_odds(likelihoods: Array, agree: BoolArray) -> Array:
     total, right = np.bincount(group, minlength=NUM_GROUPS), np.bincount(group, agree, NUM_GROUPS)
     share = isotonic_regression((right + 0.5) / (total + 1.0), weights=np.maximum(total, 1e-9)).x[group]
     return np.asarray(np.maximum(np.log(share / (1.0 - share)), 0.0))
+
+
+def _differ(one: Array, other: Array) -> bool:
+    """Whether two solutions are not the same."""
+    return bool((_turned(one, other) > np.radians(SAME_DEG)).mean() > 1.0 - SAME_SHARE)
 
 
 def _turned(one: Array, other: Array) -> Array:

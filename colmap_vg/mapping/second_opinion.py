@@ -1,0 +1,120 @@
+"""What points say of poses that the viewing graph leaves in doubt: is what should be seen there seen?
+
+Where a fold lays one part of a scene over another that looks alike, its points fit as well as those of the right model.
+But images that now stand side by side should see the same points, and see them only where the parts are alike
+(missing correspondences: Zach et al., CVPR 2008; Jiang et al., CVPR 2012).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.geometry.directions import normalized
+from colmap_vg.mapping.options import MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG, triangulator_options
+from colmap_vg.options import MappingOptions
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MAX_NUM_POINTS = 3000
+"""Points that are looked for in all images, the same share of each track length."""
+MIN_TRACK_LENGTH = 3
+NEAR_DEG = 15.0
+"""An image should see a point in its frame where another image sees it, at the point, from this near."""
+
+
+@dataclass(frozen=True)
+class PointEvidence:
+    """What the points of a model explain.
+
+    Attributes
+    ----------
+    num_observations : int
+        Observations of points that three images or more see.
+    num_expected : int
+        Of the points looked for, pairs of point and image in which the point should be seen.
+    num_seen : int
+        Those in which it is.
+    """
+
+    num_observations: int
+    num_expected: int
+    num_seen: int
+
+    @property
+    def share_seen(self) -> float:
+        """Share of what should be seen that is."""
+        return self.num_seen / self.num_expected if self.num_expected else 0.0
+
+
+def point_evidence(
+    cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", options: MappingOptions
+) -> PointEvidence:
+    """Triangulate a reconstruction of poses, in place, and count what its points explain.
+
+    Parameters
+    ----------
+    cache : pycolmap.DatabaseCache
+    reconstruction : pycolmap.Reconstruction
+        With poses, no points.
+    options : MappingOptions
+
+    Returns
+    -------
+    PointEvidence
+    """
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(reconstruction)
+    triangulator = triangulator_options(options)
+    for image_id in sorted(reconstruction.reg_image_ids()):
+        mapper.triangulate_image(triangulator, image_id)
+    mapper.complete_and_merge_tracks(triangulator)
+    mapper.observation_manager.filter_observations_with_negative_depth()
+    mapper.observation_manager.filter_all_points3D(MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG)
+    mapper.end_reconstruction(False)
+    image_ids = sorted(reconstruction.reg_image_ids())
+    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
+    tracks = [
+        (point.xyz, sorted({row_of[element.image_id] for element in point.track.elements}))
+        for _, point in sorted(reconstruction.points3D.items())
+    ]
+    tracks = sorted((t for t in tracks if len(t[1]) >= MIN_TRACK_LENGTH), key=lambda t: len(t[1]))
+    if not tracks:
+        return PointEvidence(0, 0, 0)
+    looked_for = [tracks[k] for k in np.unique(np.linspace(0, len(tracks) - 1, MAX_NUM_POINTS).astype(int))]
+    xyz = np.array([position for position, _ in looked_for])
+    sees = np.zeros((len(looked_for), len(image_ids)), dtype=bool)
+    for row, (_, seen_in) in enumerate(looked_for):
+        sees[row, seen_in] = True
+    centers = np.array([reconstruction.image(i).projection_center() for i in image_ids])
+    expected = _in_frame(reconstruction, image_ids, xyz) & _seen_from_near(xyz, centers, sees)
+    return PointEvidence(sum(len(seen) for _, seen in tracks), int(expected.sum()), int((expected & sees).sum()))
+
+
+def _in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xyz: Array) -> BoolArray:
+    """Points (k, 3) that project into each image, (k, n)."""
+    inside = np.zeros((len(xyz), len(image_ids)), dtype=bool)
+    for column, image_id in enumerate(image_ids):
+        image = reconstruction.image(image_id)
+        camera = reconstruction.camera(image.camera_id)
+        local = image.cam_from_world() * xyz
+        front = np.flatnonzero(local[:, 2] > 0)
+        pixels = np.asarray(camera.img_from_cam(local[front]), dtype=np.float64).reshape(-1, 2)
+        size = np.array([camera.width, camera.height])
+        inside[front, column] = ((pixels >= 0) & (pixels < size)).all(axis=1)
+    return inside
+
+
+def _seen_from_near(xyz: Array, centers: Array, sees: BoolArray) -> BoolArray:
+    """Images (k, n) from whose place another one that sees the point looks at it from nearly the same side."""
+    near = np.zeros(sees.shape, dtype=bool)
+    least = np.cos(np.radians(NEAR_DEG))
+    for row, point in enumerate(xyz):
+        rays = normalized(centers - point)
+        cosine = rays @ rays[sees[row]].T
+        own = np.flatnonzero(sees[row])
+        cosine[own, np.arange(len(own))] = -1.0  # not by itself
+        near[row] = cosine.max(axis=1) >= least
+    return near
