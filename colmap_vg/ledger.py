@@ -52,7 +52,7 @@ class Ledger:
         self._converged = True
         self._covariances: Array | None = None
         self._in_doubt: BoolArray | None = None
-        self._rivals: list[Array] = []
+        self._arrangements: list[Array] = []
 
     @property
     def usable(self) -> BoolArray:
@@ -72,11 +72,12 @@ class Ledger:
         """Take dropped edges back."""
         self.edge_verdicts[edge_rows] = EdgeVerdict.KEPT
 
-    def note_rivals(self, part: Subgraph, rivals: tuple[Array, ...]) -> None:
-        """Note other rotations (k, 3, 3) of a part."""
-        for rotations in rivals:
-            self._rivals.append(np.full((self.graph.num_images, 3, 3), np.nan))
-            self._rivals[-1][part.images] = rotations
+    def note_arrangements(self, part: Subgraph, rotations: tuple[Array, ...]) -> None:
+        """Note rotations (k, 3, 3) of a part, those found and others; of several parts the first, the largest."""
+        if not self._arrangements:
+            for own in rotations:
+                self._arrangements.append(np.full((self.graph.num_images, 3, 3), np.nan))
+                self._arrangements[-1][part.images] = own
 
     def doubt(self, images: IntArray, told: str) -> None:
         """Note images whose place is in doubt, and why, in a sentence."""
@@ -197,7 +198,7 @@ class Ledger:
             edge_residual_sigmas=self._edge_residual_sigmas(inside),
             agreement=agreement,
             in_doubt=self._in_doubt if in_doubt else None,
-            rivals=tuple(self._rivals),
+            arrangements=tuple(self._arrangements),
             log=tuple(self.log),
         )
 

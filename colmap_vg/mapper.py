@@ -42,6 +42,8 @@ CLEARLY_MORE, MIN_SHARE_EXPLAINED = 1.2, 0.8
 """Share of what should be seen that is, over that in another arrangement of the images, which settles between them: 1.5
 to 2.5 where one was folded and part of the scene did not repeat itself, 1.0 between two folds. An arrangement whose
 points explain much fewer observations than another's does not count."""
+ROUGH_MATCHES = 100
+"""Of a pair, for solutions that points are to compare."""
 FALSE_PAIRS = (EdgeVerdict.EXCLUDED, EdgeVerdict.ROTATION_OUTLIER)
 """Pairs whose matches are kept out of the points: a rotation that far off is not one of noise."""
 
@@ -133,7 +135,7 @@ def map_database(
         solution = _solve(graph, options, log)
         if not solution.registered.any():
             raise MappingError(f"{database_path}: {solution.message}")
-        if solution.rivals and graph.has_inliers and options.solve.method == "epipolar":
+        if solution.arrangements and graph.has_inliers and options.solve.method == "epipolar":
             solution = _second_opinion(database_path, work, graph, solution, options, log)
         built = _build(database_path, work, graph, solution, options, log)
         if not built:
@@ -212,9 +214,12 @@ def _second_opinion(
 ) -> PoseSolution:
     """Of a solution and other arrangements of its images, the one in whose images most is seen of what should be."""
     with log.stage("second opinion"):
-        others = [solve_view_graph(graph, _solve_options(options), rotations) for rotations in solution.rivals]
-        candidates = [solution, *others]
-        found = [_point_evidence(database_path, work, graph, candidate, options) for candidate in candidates]
+        # All of them roughly, so that none is judged better because more was done for it.
+        rough = replace(_solve_options(options), refine_focal_lengths="never", max_matches_per_edge=ROUGH_MATCHES)
+        found = [
+            _point_evidence(database_path, work, graph, solve_view_graph(graph, rough, rotations), options)
+            for rotations in solution.arrangements
+        ]
         shown = ", ".join(f"{evidence.share_seen:.2f}" for evidence in found)
         log.result(f"of the points that images should see, so large a share is seen in each arrangement: {shown}")
         most = max(evidence.num_observations for evidence in found)
@@ -223,8 +228,9 @@ def _second_opinion(
         if shares[best] < CLEARLY_MORE * shares[0]:
             best = 0
         settled = all(shares[best] >= CLEARLY_MORE * share for k, share in enumerate(shares) if k != best)
-        chosen, in_doubt = candidates[best], None if settled else solution.in_doubt
+        chosen, in_doubt = solution, None if settled else solution.in_doubt
         if best > 0:
+            chosen = solve_view_graph(graph, _solve_options(options), solution.arrangements[best])
             log.warn(
                 "Pairs agree with another arrangement of the images more, but there images do not see what they should:"
                 f" {shares[best]:.2f} of it is seen in the arrangement that is used, {shares[0]:.2f} in the other."

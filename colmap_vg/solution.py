@@ -98,9 +98,10 @@ class PoseSolution:
         Of each component with its pairs.
     in_doubt : (n,) bool array or None
         Images that another arrangement, with which nearly as many matches agree, places otherwise; None without one.
-    rivals : tuple of (n, 3, 3) arrays
-        cam_from_world rotations of other arrangements worth a look: that one, and the one that each image's strongest
-        pairs make. NaN for images outside the part that they arrange otherwise. Empty where there is none.
+    arrangements : tuple of (n, 3, 3) arrays
+        cam_from_world rotations, as averaged, of the arrangement that was solved and of others worth a look: that one,
+        and the one that each image's strongest pairs make. NaN outside the part that they arrange. Empty where there
+        are no others.
     log : tuple of LogEntry
     """
 
@@ -123,5 +124,5 @@ class PoseSolution:
     edge_residual_sigmas: Array | None = None
     agreement: tuple[Agreement, ...] = ()
     in_doubt: NDArray[np.bool_] | None = None
-    rivals: tuple[Array, ...] = ()
+    arrangements: tuple[Array, ...] = ()
     log: tuple[LogEntry, ...] = field(default=())

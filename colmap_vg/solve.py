@@ -198,7 +198,8 @@ def _average_rotations(ledger: Ledger, part: Subgraph, options: SolveOptions, in
 
 def _doubt_rival(ledger: Ledger, part: Subgraph, found: ConsensusRotations) -> None:
     """Note other solutions of the rotations, and say where one agrees with nearly as many matches."""
-    ledger.note_rivals(part, found.rivals)
+    if found.rivals:
+        ledger.note_arrangements(part, (found.cam_from_world_rotations, *found.rivals))
     if found.lead >= CLEAR_LEAD:
         return
     images = part.images[found.rival_images]
