@@ -8,6 +8,7 @@ from colmap_vg.geometry.directions import normalized
 
 Array = NDArray[np.float64]
 
+MAX_ANGLE_DEG = 70.0
 MAX_REPROJECTION_PX = 0.5
 """A ray that does not project back on its keypoint is wrong: some models return such rays past their field of view."""
 
@@ -40,6 +41,33 @@ def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Arr
     with np.errstate(invalid="ignore"):
         valid &= np.abs(again - points).max(axis=1) <= MAX_REPROJECTION_PX
     return normalized(rays), np.asarray(valid)
+
+
+def undistorted_pixels(camera: "pycolmap.Camera", points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where a pinhole camera with the same focal lengths and principal point would see what a camera sees.
+
+    Parameters
+    ----------
+    camera : pycolmap.Camera
+    points : (k, 2) array
+        Pixels.
+
+    Returns
+    -------
+    pixels : (k, 2) array
+        NaN where there is no ray.
+    valid : (k,) bool array
+        Where there is a ray, not more than `MAX_ANGLE_DEG` from the optical axis: beyond, a pixel of noise is many.
+    """
+    points = np.asarray(points, dtype=float)
+    if camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
+        return points, np.asarray(np.isfinite(points).all(axis=1))
+    rays, valid = bearings_of_keypoints(camera, points)
+    valid &= rays[:, 2] > np.cos(np.radians(MAX_ANGLE_DEG))
+    pixels = np.full_like(points, np.nan)
+    K = calibration_matrix(camera)
+    pixels[valid] = rays[valid, :2] / rays[valid, 2:] * np.diag(K)[:2] + K[:2, 2]
+    return pixels, np.asarray(valid)
 
 
 def calibration_matrix(camera: "pycolmap.Camera", focal_scale: float = 1.0) -> Array:

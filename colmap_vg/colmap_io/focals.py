@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.colmap_io.cameras import undistorted_pixels
 from colmap_vg.colmap_io.tables import DatabaseTables
 from colmap_vg.epipolar.self_calibration import SelfCalibration, estimate_focal_lengths
 from colmap_vg.options import ReadOptions
@@ -25,6 +26,7 @@ ALIKE = 0.03
 """Relative difference below which two votes are taken for one lens; lenses differ by more, or it does not matter."""
 MAX_PAIRS_PER_CAMERA = 400
 """Pairs that vote for a camera, those of most matches."""
+MIN_MATCHES_PER_VOTE = 16
 MAX_MATCHES_PER_VOTE = 300
 """Matches of a pair that its vote uses, evenly over its list; more change the vote by less than its own error."""
 
@@ -53,8 +55,27 @@ def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalD
     prior = np.array([c.has_prior_focal_length for c in tables.cameras], dtype=bool)
     as_given = np.ones(len(prior))
     if options.trust_focal_lengths == "always":
-        return FocalDecision(as_given, np.ones(len(prior), dtype=bool), ())
+        return FocalDecision(as_given, np.ones(len(prior), dtype=bool), _contradictions(tables, options))
     return _voted(tables, prior, options)
+
+
+def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, ...]:
+    """Sentences on focal lengths that are kept, although image pairs tell others."""
+    focals = np.array([c.focal_length_x for c in tables.cameras])
+    calibration = _self_calibration(tables, focals, np.ones(len(focals), dtype=bool), options)
+    if calibration is None:
+        return ()
+    votes = calibration.by_pairs.estimates
+    against = np.flatnonzero(calibration.by_pairs.contradicted)
+    if len(against) == 0:
+        return ()
+    first = against[0]
+    others = f" So it is with {len(against) - 1} more cameras." if len(against) > 1 else ""
+    return (
+        f"Camera {tables.cameras[first].camera_id}: {votes.support[first]} of {votes.num_pairs[first]} image pairs tell"
+        f" a focal length of {votes.focal_lengths[first]:.1f} px, not the {focals[first]:.1f} px of the database, which"
+        f" is kept as asked.{others}",
+    )
 
 
 def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> FocalDecision:
@@ -118,7 +139,7 @@ def _in_common(tables: DatabaseTables, found: Array, calibration: SelfCalibratio
 def _self_calibration(
     tables: DatabaseTables, focals: Array, given: BoolArray, options: ReadOptions
 ) -> SelfCalibration | None:
-    enough = np.diff(tables.offsets) >= max(options.min_num_inliers, 16)
+    enough = np.diff(tables.offsets) >= max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)
     chosen = np.flatnonzero(np.isin(tables.configs, (CALIBRATED, UNCALIBRATED)) & enough)
     if len(chosen) == 0:
         return None
@@ -126,7 +147,12 @@ def _self_calibration(
     rows, offsets = rows_of_segments(tables.offsets, chosen)
     thin = evenly_thinned(offsets, MAX_MATCHES_PER_VOTE)
     rows, offsets = rows[thin], segment_subset(offsets, thin)
-    points1, points2 = (tables.matched_points(rows, chosen, offsets, side) for side in (0, 1))
+    pixels, valid = _undistorted_keypoints(tables)
+    first, second = (tables.matched_keypoints(rows, chosen, offsets, side) for side in (0, 1))
+    seen = valid[first] & valid[second]
+    points1, points2, offsets = pixels[first[seen]], pixels[second[seen]], segment_subset(offsets, seen)
+    if np.diff(offsets).max(initial=0) < MIN_MATCHES_PER_VOTE:
+        return None
     return estimate_focal_lengths(
         tables.pairs[chosen],
         tables.camera_idx,
@@ -139,6 +165,21 @@ def _self_calibration(
         given=given,
         aspect_ratios=np.array([c.focal_length_y / c.focal_length_x for c in tables.cameras]),
     )
+
+
+def _undistorted_keypoints(tables: DatabaseTables) -> tuple[Array, BoolArray]:
+    """Keypoints of all images one after the other (k, 2), undistorted by the database's calibrations, and which can be.
+
+    Fundamental matrices are those of pinhole cameras; what the lens bends would be taken for another focal length.
+    """
+    sizes = [len(keypoints) for keypoints in tables.keypoints]
+    camera = np.repeat(tables.camera_idx, sizes)
+    pixels = np.concatenate([*tables.keypoints, np.zeros((0, 2))]).astype(np.float64)
+    valid = np.zeros(len(pixels), dtype=bool)
+    for row, lens in enumerate(tables.cameras):
+        own = camera == row
+        pixels[own], valid[own] = undistorted_pixels(lens, pixels[own])
+    return pixels, valid
 
 
 def _strongest_of_cameras(cameras: IntArray, num_matches: IntArray) -> BoolArray:

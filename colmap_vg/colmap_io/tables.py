@@ -73,15 +73,14 @@ class DatabaseTables:
     matches: IntArray
     caveats: tuple[str, ...] = ()
 
-    def matched_points(self, rows: IntArray, pairs: IntArray, offsets: IntArray, side: int) -> Array:
-        """Pixels (k, 2) of chosen rows of `matches` in image 1 (side 0) or 2 (side 1).
+    def matched_keypoints(self, rows: IntArray, pairs: IntArray, offsets: IntArray, side: int) -> IntArray:
+        """Places (k,) of chosen rows of `matches` in image 1 (side 0) or 2 (side 1) among all images' keypoints.
 
         `pairs` are the pairs of the rows, `offsets` their segments in `rows`.
         """
         starts = np.concatenate([[0], np.cumsum([len(k) for k in self.keypoints])])
-        points = np.concatenate([*self.keypoints, np.zeros((0, 2), dtype=np.float32)])
         image = np.repeat(self.pairs[pairs, side], np.diff(offsets))
-        return np.asarray(points[starts[image] + self.matches[rows, side]], dtype=np.float64)
+        return np.asarray(starts[image] + self.matches[rows, side], dtype=np.int64)
 
 
 def read_tables(database_path: str | PathLike[str]) -> DatabaseTables:

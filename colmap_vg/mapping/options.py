@@ -7,6 +7,8 @@ from colmap_vg.options import MappingOptions
 MAX_REPROJECTION_PX = 4.0
 MIN_TRIANGULATION_ANGLE_DEG = 1.5
 """COLMAP's own thresholds for points."""
+MAX_EXTRA_PARAM = 1e6
+"""COLMAP leaves out cameras with a distortion parameter above 1, which some models rightly have (EUCM's beta)."""
 MIN_TRACK_LENGTH = 3
 """Of points that adjust cameras."""
 
@@ -17,6 +19,7 @@ def triangulator_options(options: MappingOptions) -> "pycolmap.IncrementalTriang
         min_angle=MIN_TRIANGULATION_ANGLE_DEG,
         complete_max_reproj_error=MAX_REPROJECTION_PX,
         merge_max_reproj_error=MAX_REPROJECTION_PX,
+        max_extra_param=MAX_EXTRA_PARAM,
         random_seed=options.random_seed,
     )
 
@@ -28,6 +31,7 @@ def mapper_options(options: MappingOptions) -> "pycolmap.IncrementalMapperOption
         abs_pose_refine_extra_params=options.ba_refine_extra_params,
         filter_max_reproj_error=MAX_REPROJECTION_PX,
         filter_min_tri_angle=MIN_TRIANGULATION_ANGLE_DEG,
+        max_extra_param=MAX_EXTRA_PARAM,
         num_threads=options.num_threads,
         random_seed=options.random_seed,
     )
