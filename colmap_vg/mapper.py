@@ -178,7 +178,10 @@ def _build(
     shared = shared_cameras(graph) if options.share_cameras and refined else []
     without = _false_pairs(graph, solution)
     with log.stage("load"):
-        with loaded_cache(database_path, work, options.read.min_num_inliers, shared, without) as (cache, replaced):
+        with loaded_cache(database_path, work, options.read.min_num_inliers, shared, without, graph) as (
+            cache,
+            replaced,
+        ):
             components = range(int(solution.component.max(initial=-1)) + 1)
             posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
         if replaced:
@@ -195,7 +198,7 @@ def _build(
     if models and replaced:
         with (
             log.stage("cameras"),
-            loaded_cache(database_path, work, options.read.min_num_inliers, without_pairs=without) as (cache, _),
+            loaded_cache(database_path, work, options.read.min_num_inliers, (), without, graph) as (cache, _),
         ):
             models = [
                 replace(m, reconstruction=_on_own_cameras(cache, m.reconstruction, replaced, options, log))
@@ -246,9 +249,10 @@ def _second_opinion(
 def _point_evidence(
     database_path: str | PathLike[str], work: Path, graph: ViewGraph, solution: PoseSolution, options: MappingOptions
 ) -> PointEvidence:
-    with loaded_cache(
-        database_path, work, options.read.min_num_inliers, without_pairs=_false_pairs(graph, solution)
-    ) as (cache, _):
+    with loaded_cache(database_path, work, options.read.min_num_inliers, (), _false_pairs(graph, solution), graph) as (
+        cache,
+        _,
+    ):
         return point_evidence(cache, reconstruction_from_solution(cache, solution, graph, 0), options)
 
 

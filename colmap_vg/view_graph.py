@@ -60,6 +60,8 @@ class ViewGraph:
         `EdgeVerdict` words given on reading; edges other than ``kept`` and ``rotation_only`` are not solved with.
     trusted : (m,) bool array or None
         Edges that no filter may drop, on the user's word.
+    verified_anew : (m,) bool array or None
+        Pairs whose matches or configuration are not those of the database, which did not explain each other.
     planar : (m,) bool array or None
         Pairs explained by a homography; their relative pose is less certain.
     triangulation_angles : (m,) array or None
@@ -88,6 +90,7 @@ class ViewGraph:
     camera_radial: BoolArray | None = field(default=None, kw_only=True)
     read_verdicts: NDArray[np.str_] | None = field(default=None, kw_only=True)
     trusted: BoolArray | None = field(default=None, kw_only=True)
+    verified_anew: BoolArray | None = field(default=None, kw_only=True)
     planar: BoolArray | None = field(default=None, kw_only=True)
     triangulation_angles: Array | None = field(default=None, kw_only=True)
     edge_information: Array | None = field(default=None, kw_only=True)
@@ -158,6 +161,7 @@ class ViewGraph:
             "read_verdicts": (m,),
             "trusted": (m,),
             "planar": (m,),
+            "verified_anew": (m,),
             "triangulation_angles": (m,),
             "edge_information": (m, 5, 5),
             "inlier_offsets": (m + 1,),
@@ -241,6 +245,7 @@ _KINDS: dict[str, type] = {
     "read_verdicts": np.str_,
     "trusted": np.bool_,
     "planar": np.bool_,
+    "verified_anew": np.bool_,
     "triangulation_angles": np.float64,
     "edge_information": np.float64,
     "inlier_offsets": np.int64,

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.cameras import undistorted_pixels
 from colmap_vg.colmap_io.tables import DatabaseTables
+from colmap_vg.colmap_io.undistortion import undistorted_keypoints
 from colmap_vg.epipolar.self_calibration import SelfCalibration, estimate_focal_lengths
 from colmap_vg.options import ReadOptions
 from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_subset
@@ -147,7 +147,7 @@ def _self_calibration(
     rows, offsets = rows_of_segments(tables.offsets, chosen)
     thin = evenly_thinned(offsets, MAX_MATCHES_PER_VOTE)
     rows, offsets = rows[thin], segment_subset(offsets, thin)
-    pixels, valid = _undistorted_keypoints(tables)
+    pixels, valid = undistorted_keypoints(tables)
     first, second = (tables.matched_keypoints(rows, chosen, offsets, side) for side in (0, 1))
     seen = valid[first] & valid[second]
     points1, points2, offsets = pixels[first[seen]], pixels[second[seen]], segment_subset(offsets, seen)
@@ -165,21 +165,6 @@ def _self_calibration(
         given=given,
         aspect_ratios=np.array([c.focal_length_y / c.focal_length_x for c in tables.cameras]),
     )
-
-
-def _undistorted_keypoints(tables: DatabaseTables) -> tuple[Array, BoolArray]:
-    """Keypoints of all images one after the other (k, 2), undistorted by the database's calibrations, and which can be.
-
-    Fundamental matrices are those of pinhole cameras; what the lens bends would be taken for another focal length.
-    """
-    sizes = [len(keypoints) for keypoints in tables.keypoints]
-    camera = np.repeat(tables.camera_idx, sizes)
-    pixels = np.concatenate([*tables.keypoints, np.zeros((0, 2))]).astype(np.float64)
-    valid = np.zeros(len(pixels), dtype=bool)
-    for row, lens in enumerate(tables.cameras):
-        own = camera == row
-        pixels[own], valid[own] = undistorted_pixels(lens, pixels[own])
-    return pixels, valid
 
 
 def _strongest_of_cameras(cameras: IntArray, num_matches: IntArray) -> BoolArray:

@@ -11,6 +11,7 @@ from colmap_vg.colmap_io.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.relative_poses import relative_poses
 from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
+from colmap_vg.colmap_io.verification import with_own_geometries
 from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
 from colmap_vg.two_view.segments import evenly_thinned, segment_subset
@@ -19,6 +20,7 @@ from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | None = None) -> ViewGraph:
@@ -49,12 +51,12 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
 @single_threaded_blas
 def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) -> tuple[ViewGraph, tuple[str, ...]]:
     """The viewing graph, and what was changed or could not be decided on reading, one sentence each."""
-    tables = read_tables(database_path)
+    tables, changed = with_own_geometries(read_tables(database_path), options.random_seed)
     focals = decide_focal_lengths(tables, options)
-    return _graph(tables, focals, options), (*tables.caveats, *focals.caveats)
+    return _graph(tables, focals, changed, options), (*tables.caveats, *focals.caveats)
 
 
-def _graph(tables: DatabaseTables, focals: FocalDecision, options: ReadOptions) -> ViewGraph:
+def _graph(tables: DatabaseTables, focals: FocalDecision, changed: BoolArray, options: ReadOptions) -> ViewGraph:
     cameras = [with_focal_scale(c, s) for c, s in zip(tables.cameras, focals.scales, strict=True)]
     offsets, matches, bearings1, bearings2 = _rays_of_matches(tables, cameras)
     geometry = relative_poses(
@@ -82,6 +84,7 @@ def _graph(tables: DatabaseTables, focals: FocalDecision, options: ReadOptions) 
         camera_radial=np.array([has_radial_term(c) for c in cameras], dtype=bool),
         read_verdicts=verdicts,
         trusted=trusted if trusted.any() else None,
+        verified_anew=changed if changed.any() else None,
         planar=geometry.planar,
         triangulation_angles=geometry.angles,
         edge_information=geometry.information,

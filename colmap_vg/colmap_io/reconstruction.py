@@ -25,6 +25,7 @@ def loaded_cache(
     min_num_matches: int,
     shared: Sequence[Sequence[int]] = (),
     without_pairs: Sequence[tuple[int, int]] = (),
+    graph: ViewGraph | None = None,
 ) -> Iterator[tuple["pycolmap.DatabaseCache", dict[int, int]]]:
     """COLMAP's view of a database, read from a copy that is gone afterwards: opening a database changes the file.
 
@@ -38,6 +39,8 @@ def loaded_cache(
         Cameras to be merged, see `merge_cameras`.
     without_pairs : sequence of (int, int)
         Image ids of pairs whose matches are left out.
+    graph : ViewGraph, optional
+        As read from the database: the matches of pairs that were verified anew take the place of the database's.
 
     Yields
     ------
@@ -54,6 +57,8 @@ def loaded_cache(
     try:
         try:
             replaced: dict[int, int] = {}
+            if graph is not None:
+                _replace_matches(copy, graph)
             if without_pairs:
                 _delete_pairs(copy, without_pairs)
             if shared:
@@ -69,6 +74,22 @@ def loaded_cache(
     finally:
         for leftover in work_folder.glob(copy.name + "*"):
             leftover.unlink()
+
+
+def _replace_matches(copy: Path, graph: ViewGraph) -> None:
+    """Give pairs that were verified anew their matches, and a configuration that COLMAP takes."""
+    offsets, keypoints1, keypoints2 = graph.inlier_offsets, graph.inlier_keypoints1, graph.inlier_keypoints2
+    if graph.verified_anew is None or offsets is None or keypoints1 is None or keypoints2 is None:
+        return
+    rows = []
+    for edge in np.flatnonzero(graph.verified_anew).tolist():
+        own = slice(*offsets[edge : edge + 2].tolist())
+        matches = np.stack([keypoints1[own], keypoints2[own]], axis=1).astype(np.uint32)
+        pair_id = pycolmap.image_pair_to_pair_id(*graph.image_ids[graph.edges[edge]].tolist())
+        config = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+        rows.append((len(matches), matches.tobytes(), config, pair_id))
+    with closing(sqlite3.connect(copy)) as connection, connection:
+        connection.executemany("UPDATE two_view_geometries SET rows = ?, data = ?, config = ? WHERE pair_id = ?", rows)
 
 
 def _delete_pairs(copy: Path, pairs: Sequence[tuple[int, int]]) -> None:

@@ -1,0 +1,156 @@
+"""Which two-view geometries of a database explain their own matches, and new ones for those that do not.
+
+Databases are filled by many tools: matrices may be placeholders, belong to other matches, or be missing, and matches
+may never have been verified. A matrix or pose is believed when the median match of its pair is within COLMAP's
+threshold of it, as it stands or on undistorted keypoints. Elsewhere the matrices are forgotten; where the matches do
+not agree on a geometry of their own, pycolmap verifies them.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.cameras import calibration_matrix
+from colmap_vg.colmap_io.tables import DatabaseTables
+from colmap_vg.colmap_io.undistortion import undistorted_keypoints
+from colmap_vg.geometry import so3
+from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
+from colmap_vg.two_view.segments import (
+    evenly_thinned,
+    rows_of_segments,
+    segment_of_rows,
+    segment_quantiles,
+    segment_subset,
+    segment_sums,
+)
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+MAX_ERROR_PX = 4.0
+"""COLMAP's threshold of two-view verification."""
+MIN_SHARE_AGREEING = 0.97
+"""Of a pair's matches, within the threshold of one fundamental matrix, that makes them look verified."""
+MATCHES_LOOKED_AT = 100
+MIN_NUM_MATCHES, MIN_NUM_REFITTED = 15, 8
+FAR = 1e12
+"""Pixels; where a matrix is missing or tells nothing of a match."""
+UNDEFINED, DEGENERATE, CALIBRATED, UNCALIBRATED, WATERMARK = 0, 1, 2, 3, 7
+
+
+def with_own_geometries(tables: DatabaseTables, seed: int) -> tuple[DatabaseTables, BoolArray]:
+    """Tables whose matrices explain their matches, or are missing.
+
+    Parameters
+    ----------
+    tables : DatabaseTables
+    seed : int
+        Of the verification.
+
+    Returns
+    -------
+    tables : DatabaseTables
+        With a caveat where pairs were changed.
+    changed : (m,) bool array
+        Pairs whose configuration or matches are not those of the database.
+    """
+    straight, _ = undistorted_keypoints(tables)
+    raw = np.concatenate([*tables.keypoints, np.zeros((0, 2))]).astype(np.float64)
+    judged = ~np.isin(tables.configs, (DEGENERATE, WATERMARK)) & (np.diff(tables.offsets) >= MIN_NUM_REFITTED)
+    unbelieved = np.flatnonzero(judged & ~_explained(tables, (raw, straight)))
+    changed = np.zeros(len(tables.pairs), dtype=bool)
+    if len(unbelieved) == 0:
+        return tables, changed
+    changed[unbelieved] = True
+    rows, offsets = rows_of_segments(tables.offsets, unbelieved)
+    points1, points2 = (straight[tables.matched_keypoints(rows, unbelieved, offsets, side)] for side in (0, 1))
+    F = estimate_fundamental_from_inliers(offsets, points1, points2)
+    agree = np.abs(epipolar_distances(F, offsets, points1, points2)) <= MAX_ERROR_PX
+    shares = segment_sums(offsets, agree.astype(float)) / np.maximum(np.diff(offsets), 1)
+    configs, matrices = tables.configs.copy(), {name: getattr(tables, name).copy() for name in ("E", "F", "H")}
+    for matrix in matrices.values():
+        matrix[unbelieved] = np.nan
+    given = np.array([c.has_prior_focal_length for c in tables.cameras], dtype=bool)
+    prior = np.asarray(given[tables.camera_idx[tables.pairs]].all(axis=1))
+    undefined = configs == UNDEFINED
+    configs[undefined] = np.where(prior[undefined], CALIBRATED, UNCALIBRATED)
+    # Under a given focal length the pose is found from the rays; else the fundamental matrix must tell it.
+    guessed = unbelieved[~prior[unbelieved]]
+    matrices["F"][guessed] = F[~prior[unbelieved]]
+    rotations, translations = tables.rotations.copy(), tables.translations.copy()
+    rotations[unbelieved], translations[unbelieved] = np.nan, np.nan
+    doubtful = unbelieved[shares < MIN_SHARE_AGREEING]
+    found = replace(tables, configs=configs, rotations=rotations, translations=translations, **matrices)
+    caveat = (
+        f"{len(unbelieved)} of {len(tables.pairs)} pairs hold no matrix that explains their matches; their geometry is"
+        " estimated from the matches."
+    )
+    if len(doubtful):
+        before = int(np.diff(tables.offsets)[doubtful].sum())
+        found = _verified(found, doubtful, seed)
+        after = int(np.diff(found.offsets)[doubtful].sum())
+        caveat += f" In {len(doubtful)} of them matches look unverified: {before - after} of {before} were wrong."
+    return replace(found, caveats=(*tables.caveats, caveat)), changed
+
+
+def _explained(tables: DatabaseTables, pixels: tuple[Array, Array]) -> BoolArray:
+    """Pairs (m,) whose median match is near one of their matrices, on pixels as they are or undistorted."""
+    every = np.arange(len(tables.pairs))
+    thin = evenly_thinned(tables.offsets, MATCHES_LOOKED_AT)
+    offsets, rows = segment_subset(tables.offsets, thin), np.flatnonzero(thin)
+    first, second = (tables.matched_keypoints(rows, every, offsets, side) for side in (0, 1))
+    K = np.linalg.inv(np.array([calibration_matrix(c) for c in tables.cameras]).reshape(-1, 3, 3))
+    camera1, camera2 = tables.camera_idx[tables.pairs].T
+    of_pose = so3.hat(np.nan_to_num(tables.translations)) @ tables.rotations
+    of_E, of_pose = (np.swapaxes(K[camera2], 1, 2) @ E @ K[camera1] for E in (tables.E, of_pose))
+    explained = np.zeros(len(every), dtype=bool)
+    for points in pixels:
+        epipolar = ((matrix, epipolar_distances) for matrix in (tables.F, of_E, of_pose))
+        for matrix, distance in (*epipolar, (tables.H, transfers)):
+            far = np.abs(distance(matrix, offsets, points[first], points[second]))
+            explained |= segment_quantiles(offsets, np.nan_to_num(far, nan=FAR, posinf=FAR)) <= MAX_ERROR_PX
+    return explained
+
+
+def epipolar_distances(F: Array, offsets: IntArray, points1: Array, points2: Array) -> Array:
+    """Sampson distances (k,) of matches, pixels."""
+    F = F[segment_of_rows(offsets)]
+    x1, x2 = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (points1, points2))
+    line2, line1 = np.einsum("kab,kb->ka", F, x1), np.einsum("kab,ka->kb", F, x2)
+    length = np.sqrt((line2[:, :2] ** 2).sum(axis=1) + (line1[:, :2] ** 2).sum(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.einsum("ka,ka->k", x2, line2) / length)
+
+
+def transfers(H: Array, offsets: IntArray, points1: Array, points2: Array) -> Array:
+    """Distances (k,) of matches from where a homography takes them, pixels."""
+    x1 = np.concatenate([points1, np.ones((len(points1), 1))], axis=1)
+    moved = np.einsum("kab,kb->ka", H[segment_of_rows(offsets)], x1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.linalg.norm(moved[:, :2] / moved[:, 2:] - points2, axis=1))
+
+
+def _verified(tables: DatabaseTables, pairs: IntArray, seed: int) -> DatabaseTables:
+    """Tables with the inlier matches, matrices and configurations of pairs that pycolmap verified."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    kept = [tables.matches[a:b] for a, b in zip(tables.offsets[:-1], tables.offsets[1:], strict=True)]
+    configs = tables.configs.copy()
+    matrices = {name: getattr(tables, name).copy() for name in ("E", "F", "H")}
+    for pair in pairs.tolist():
+        i, j = tables.pairs[pair].tolist()
+        lens1, lens2 = (tables.cameras[tables.camera_idx[image]] for image in (i, j))
+        points1, points2 = (tables.keypoints[image].astype(np.float64) for image in (i, j))
+        geometry = pycolmap.estimate_two_view_geometry(
+            lens1, points1, lens2, points2, kept[pair].astype(np.uint32), options
+        )
+        kept[pair] = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
+        configs[pair] = int(geometry.config) if len(kept[pair]) >= MIN_NUM_MATCHES else DEGENERATE
+        for name, matrix in matrices.items():
+            value = getattr(geometry, name)
+            matrix[pair] = np.nan if value is None else value
+    offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
+    return replace(tables, matches=np.concatenate(kept), offsets=offsets, configs=configs, **matrices)
