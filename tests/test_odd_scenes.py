@@ -9,7 +9,14 @@ import pycolmap
 import pytest
 from synthetic_databases import centers, make_database, pair_id, two_view_tracks_only, write_views
 
-from colmap_vg import ImageVerdict, align_positions, read_view_graph, solve_view_graph, view_graph_mapping
+from colmap_vg import (
+    ImageVerdict,
+    SolutionStatus,
+    align_positions,
+    read_view_graph,
+    solve_view_graph,
+    view_graph_mapping,
+)
 from colmap_vg.errors import MappingError
 from colmap_vg.geometry import so3
 
@@ -53,6 +60,23 @@ def test_cameras_that_only_turn_or_stand_still_are_named(
     with pytest.raises(MappingError, match="turned on the spot"):
         view_graph_mapping(tmp_path / "a.db", None, tmp_path / "out")
     assert not (tmp_path / "out" / "0").exists()
+
+
+@pytest.mark.parametrize("shake", [0.003, 0.01, 0.03])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_camera_that_all_but_turns_is_not_called_solved(tmp_path: Path, shake: float, seed: int) -> None:
+    """Baselines of the noise's size: what is registered is near the truth, or the rest is named uncertain."""
+    rng = np.random.default_rng(seed)
+    turns, places = np.outer(np.arange(8), [0.0, 0.05, 0.0]), shake * rng.standard_normal((8, 3))
+    write_views(tmp_path / "a.db", poses(turns, places), POINTS, CALIBRATED, noise_px=0.5)
+    solution = solve_view_graph(read_view_graph(tmp_path / "a.db"))
+    rows = np.flatnonzero(solution.registered)
+    if solution.status == SolutionStatus.SOLVED:
+        errors, _ = align_positions(solution.projection_centers[rows], places[rows])
+        assert errors.mean() < 0.15 * np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1)))
+    else:
+        left = set(solution.image_verdicts[~solution.registered])
+        assert left <= {ImageVerdict.UNCERTAIN, ImageVerdict.NOT_RIGID, ImageVerdict.NO_EDGES}
 
 
 @pytest.mark.parametrize("step", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.3)])
