@@ -149,6 +149,15 @@ def ignored_flags(arguments: Sequence[str]) -> list[str]:
     return flags
 
 
+def misspelt_flag(arguments: Sequence[str]) -> str | None:
+    """The first long flag with one dash, whose letters would count as flags of their own; None where there is none."""
+    for argument in arguments:
+        name = argument.partition("=")[0]
+        if name.startswith("-") and not name.startswith("--") and "_" in name:
+            return name
+    return None
+
+
 def parse_boolean(value: str) -> bool | None:
     """True or false as COLMAP spells them (0, 1, true, false, in any case); None for anything else."""
     return {"1": True, "true": True, "0": False, "false": False}.get(value.lower())

@@ -17,8 +17,8 @@ from colmap_vg.options import Matching as MatchingOption
 from colmap_vg.options import Method as SolverMethod
 from colmap_vg.options import Quality as QualityPreset
 
-INTERRUPTED = 130
-"""Exit code of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
+USAGE, INTERRUPTED = 2, 130
+"""Exit codes of wrong usage, and of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
 
 METHODS = "|".join(get_args(SolverMethod))
 DEFAULTS = MappingOptions()
@@ -360,6 +360,10 @@ def explain(
 
 def main() -> None:
     """Entry point of ``colmap-vg`` and ``python -m colmap_vg``."""
+    single = colmap_flags.misspelt_flag(sys.argv[1:])
+    if single is not None:
+        typer.echo(f"error: no such option: {single}; did you mean -{single}? (see --help)", err=True)
+        sys.exit(USAGE)
     try:
         app()
     except KeyboardInterrupt:

@@ -1,6 +1,7 @@
 """Matches of a database's features: of all pairs, of pairs chosen beforehand, of neighbours in time or in space."""
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -59,10 +60,9 @@ def _match(database_path: str | PathLike[str], options: FeatureOptions, log: Sta
     """Match; what there is to say of the choice of pairs."""
     matching, verification, device = *_matching_options(options), pycolmap.Device.cpu
     if options.matching == "sequential":
-        sequential = pycolmap.SequentialPairingOptions()
-        sequential.overlap = options.sequential_overlap
-        sequential.num_threads = options.num_threads
-        pycolmap.match_sequential(database_path, matching, sequential, verification, device)
+        with pycolmap.Database.open(database_path) as database:
+            names = [image.name for image in database.read_all_images()]
+        match_pairs(database_path, sequential_pairs(names, options.sequential_overlap), options, log)
         return ""
     if options.matching == "spatial":
         _require_positions(database_path, log)
@@ -125,6 +125,36 @@ def promising_pairs(database_path: str | PathLike[str], num_threads: int, log: S
         features, _num_threads(num_threads), lambda done: log.progress("choosing pairs", _SELECTING * done)
     )
     return [(images[first].name, images[second].name) for first, second in select_pairs(*counts)]
+
+
+def sequential_pairs(names: Sequence[str], overlap: int) -> list[tuple[str, str]]:
+    """Pairs of each image with those that follow it, and with others at growing distances.
+
+    Parameters
+    ----------
+    names : sequence of str
+        In any order. Numbers in them count as numbers: frame2 comes before frame10.
+    overlap : int
+        Images that follow, and powers of two from 1 on at whose distances others are taken.
+
+    Returns
+    -------
+    list of (str, str)
+    """
+    ordered = sorted(names, key=_natural)
+    distances = sorted({*range(1, overlap + 1), *(2**power for power in range(overlap) if 2**power < len(ordered))})
+    return [
+        (name, ordered[place + distance])
+        for place, name in enumerate(ordered)
+        for distance in distances
+        if place + distance < len(ordered)
+    ]
+
+
+def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Key by which runs of digits sort as numbers, before letters; equal numbers by the name as it is."""
+    parts = [part for part in re.split(r"([0-9]+)", name) if part]
+    return [(0, int(part), "") if part.isdecimal() and part.isascii() else (1, 0, part) for part in parts], name
 
 
 def match_pairs(

@@ -378,3 +378,10 @@ def test_a_finished_job_explains_itself(database_path: Path, tmp_path: Path) -> 
     assert "error: no image" in result.stderr
     assert invoke("explain", "--output_path", output, "--image", "a", "--pair", "a", "b").exit_code == 2
     assert invoke("explain", "--output_path", tmp_path).exit_code == 1
+
+
+def test_a_long_flag_with_one_dash_is_wrong_usage() -> None:
+    done = subprocess.run([*COMMAND, "mapper", "-database_path", "x"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "did you mean --database_path?" in done.stderr

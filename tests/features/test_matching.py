@@ -1,5 +1,6 @@
 """The chosen pairs are matched as pycolmap matches them, whatever the images are called and however a job ended."""
 
+import itertools
 import struct
 from dataclasses import replace
 from functools import partial
@@ -14,7 +15,7 @@ from rendered_corner import Corner, render_corner, write_jpeg
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.features import matching
 from colmap_vg.features.extraction import extract_and_match
-from colmap_vg.features.matching import match_features, match_pairs, promising_pairs, restore_names
+from colmap_vg.features.matching import match_features, match_pairs, promising_pairs, restore_names, sequential_pairs
 from colmap_vg.features.pair_selection import select_pairs
 from colmap_vg.options import FeatureOptions
 from colmap_vg.stages import StageLog
@@ -189,3 +190,18 @@ def with_position(jpeg: bytes, latitude: float, longitude: float) -> bytes:
     body += struct.pack("<H", 5) + b"".join(entries) + bytes(4)
     body += degrees(latitude) + degrees(longitude) + struct.pack("<II", 50, 1)
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
+def test_frames_follow_each_other_as_people_count() -> None:
+    names = [f"frame{k}.jpg" for k in range(1, 25)]
+    shuffled = [names[k] for k in np.random.default_rng(0).permutation(24)]
+    pairs = sequential_pairs(shuffled, 1)
+    assert pairs == list(itertools.pairwise(names))
+    near = {(a, b) for a, b in sequential_pairs(shuffled, 3) if a == "frame2.jpg"}
+    assert near == {("frame2.jpg", f"frame{k}.jpg") for k in (3, 4, 5, 6)}  # three that follow, and the fourth
+
+
+def test_folders_and_names_without_numbers_have_an_order() -> None:
+    ordered = ["1/a.jpg", "2/a.jpg", "2/b.jpg", "10/a.jpg", "a1.jpg", "a01b.jpg", "a2.jpg", "a.jpg"]
+    assert sequential_pairs(ordered[::-1], 1) == list(itertools.pairwise(ordered))
+    assert sequential_pairs(["a.jpg"], 5) == []
