@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from synthetic_databases import centers, look_at
+from synthetic_databases import centers, look_at, make_database
 
 from colmap_vg import MappingOptions, align_positions, read_view_graph
 from colmap_vg.mapper import map_database
@@ -102,3 +102,14 @@ def test_a_wrong_focal_length_that_must_stay_stays_with_a_warning(tmp_path: Path
     assert "not the 800.0 px" in told
     free = map_database(tmp_path / "a.db", None, tmp_path / "free", MappingOptions(), StageLog())
     assert abs(free.models[0].camera(1).mean_focal_length() - 600.0) < 6.0
+
+
+@pytest.mark.parametrize(("model", "odd"), [("FULL_OPENCV", True), ("OPENCV", False)])
+def test_coefficients_beyond_reason_are_a_warning(model: str, odd: bool, tmp_path: Path) -> None:
+    """Narrow views tell no high-order terms: bundle adjustment plays them against each other."""
+    params = (2600.0, 2600.0, 512.0, 384.0, -0.05, 0.01, 0.0, 0.0) + (0.0,) * (4 if odd else 0)
+    make_database(tmp_path / "a.db", num_images=8, num_points=60, noise_px=0.5, camera=(model, params))
+    log = StageLog()
+    lens = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log).models[0].camera(1)
+    assert (np.abs(lens.params[4:]).max() > 10.0) == odd
+    assert any("hold" in warning and "do not tell" in warning for warning in log.warnings) == odd

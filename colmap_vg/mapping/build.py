@@ -26,6 +26,8 @@ from colmap_vg.stages import StageLog
 MIN_SUPPORTED_OBSERVATIONS = 15
 """Observations of points seen in three views or more that an image needs to stay: three times what fixes a pose."""
 
+MAX_SANE_COEFFICIENT = 10.0
+"""Of a lens's distortion, in COLMAP's models; those of real lenses stay far below."""
 MAX_NUM_ROUNDS = 6
 """Rounds of adjusting and triangulating anew, at most."""
 GOOD_START_COST, SETTLED_COST = 0.5, 0.7
@@ -119,6 +121,7 @@ def build_model(
             removed, added = removed | again, added - again
         log.result(f"{len(added)} images added, {len(removed)} removed")
         folded = _warn_of_folds(reconstruction, pairs, log)
+        _warn_of_lenses(reconstruction, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return BuildResult(frozenset(added), frozenset(removed), frozenset(misplaced), folded)
@@ -235,6 +238,23 @@ def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
         names = sorted(reconstruction.image(i).name for i in found.contradicted)
         log.warn(f"The pairs of {len(names)} images tell other rotations than the model (first: {names[0]}).")
     return len(found.detached) > 0
+
+
+def _warn_of_lenses(reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
+    """Warn of lenses whose coefficients make up for each other: narrow views do not tell the higher ones."""
+    used = sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()})
+    largest = {
+        camera_id: max((abs(lens.params[k]) for k in lens.extra_params_idxs()), default=0.0)
+        for camera_id, lens in ((camera_id, reconstruction.camera(camera_id)) for camera_id in used)
+    }
+    odd = [camera_id for camera_id in used if largest[camera_id] > MAX_SANE_COEFFICIENT]
+    if odd:
+        others = f", and of {len(odd) - 1} more" if len(odd) > 1 else ""
+        log.warn(
+            f"The {reconstruction.camera(odd[0]).model_name} lens of camera {odd[0]}{others} has coefficients up to"
+            f" {largest[odd[0]]:.3g}, which the photographs do not tell: it holds inside the images only. Use a simpler"
+            " camera model, or keep the coefficients (ba_refine_extra_params)."
+        )
 
 
 def _state(reconstruction: "pycolmap.Reconstruction") -> str:
