@@ -114,8 +114,22 @@ OBEYED = (
 """Flags of the other mappers that are obeyed."""
 
 
+REFUSED = {
+    "--input_path": "a job starts from the database alone",
+    "--image_list_path": "all images of the database are mapped",
+    "--Mapper.image_list_path": "all images of the database are mapped",
+    "--GlobalMapper.image_list_path": "all images of the database are mapped",
+    "--Mapper.fix_existing_images": "all cameras are adjusted",
+    "--Mapper.fix_existing_frames": "all cameras are adjusted",
+    "--Mapper.constant_rig_list_path": "all cameras are adjusted",
+    "--Mapper.constant_camera_list_path": "all intrinsics are adjusted, or none (--ba_refine_focal_length and others)",
+}
+"""Flags of the other mappers that restrict a job, and what is done here in place of it: a model made without the
+restriction would look as if it had been obeyed."""
+
+
 class UnknownArgumentError(Exception):
-    """An argument that none of the mappers knows; the message says which."""
+    """An argument that none of the mappers knows, or that is not to be had here; the message says which."""
 
 
 def ignored_flags(arguments: Sequence[str]) -> list[str]:
@@ -134,18 +148,21 @@ def ignored_flags(arguments: Sequence[str]) -> list[str]:
     Raises
     ------
     UnknownArgumentError
-        For the first argument that is no known flag.
+        For the first argument that is no known flag, or restricts the job as is not done here.
     """
     flags: list[str] = []
     position = 0
     while position < len(arguments):
-        name, separator, _ = arguments[position].partition("=")
+        name, separator, value = arguments[position].partition("=")
         if name not in IGNORED:
             raise UnknownArgumentError(_unknown(name))
         flags.append(name)
         position += 1
         if not separator and position < len(arguments) and not arguments[position].startswith("--"):
+            value = arguments[position]
             position += 1
+        if name in REFUSED and parse_boolean(value) is not False:
+            raise UnknownArgumentError(f"{name} is not supported: {REFUSED[name]}")
     return flags
 
 

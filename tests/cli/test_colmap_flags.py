@@ -5,7 +5,7 @@ from typing import Any
 import pycolmap
 import pytest
 
-from colmap_vg.cli.colmap_flags import IGNORED, OBEYED, UnknownArgumentError, ignored_flags, parse_boolean
+from colmap_vg.cli.colmap_flags import IGNORED, OBEYED, REFUSED, UnknownArgumentError, ignored_flags, parse_boolean
 
 
 def field_names(options: Any) -> set[str]:
@@ -32,6 +32,15 @@ def test_every_option_of_pycolmaps_global_mapper_is_known() -> None:
 
 def test_no_flag_is_both_obeyed_and_ignored() -> None:
     assert not IGNORED.intersection(OBEYED)
+
+
+@pytest.mark.parametrize("flag", REFUSED)
+def test_flags_that_restrict_a_job_are_refused_unless_they_are_off(flag: str) -> None:
+    assert flag in IGNORED
+    for arguments in ([flag, "some.txt"], [f"{flag}=1"], [flag]):
+        with pytest.raises(UnknownArgumentError, match=f"{flag} is not supported: all|{flag} is not supported: a job"):
+            ignored_flags(arguments)
+    assert ignored_flags([flag, "0"]) == [flag]
 
 
 def test_values_are_taken_off() -> None:
