@@ -82,7 +82,7 @@ def outcome(rows: NDArray[np.int64], rotations: Array, scene: SyntheticScene) ->
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num_graphs", type=int, default=100)
+    parser.add_argument("--num_graphs", type=int, required=True)
     parser.add_argument("--first_seed", type=int, default=0)
     options = parser.parse_args()
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
