@@ -59,7 +59,7 @@ def image_folder_mapping(
     ColmapVgError
         The folder or its photographs cannot be used, the output cannot be written, or no model could be made.
     """
-    options = options or MappingOptions()
+    options = MappingOptions.given(options)
     with output_lock(output_path):
         make_database(image_path, output_path, features, StageLog(on_event), overwrite=options.overwrite)
         database_path = Path(output_path) / DATABASE_NAME
@@ -99,7 +99,7 @@ def make_database(
     OutputError
         The output cannot be written, or holds models, or a database made by something else.
     """
-    options, log = options or FeatureOptions(), log or StageLog()
+    options, log = FeatureOptions.given(options), log or StageLog()
     refuse_models(output_path, overwrite)
     finished, record_path = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME / RECORD_NAME
     if finished.exists() and not record_path.exists() and not overwrite:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.agreement import pair_agreement
 from colmap_vg.colmap_io.database import check_database
+from colmap_vg.colmap_io.quiet import quiet_colmap
 from colmap_vg.colmap_io.read import read_with_caveats
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
@@ -100,8 +101,12 @@ def view_graph_mapping(
         The output cannot be written or already holds a model.
     MappingError
         No model could be made.
+    OptionError
+        The options are of another kind.
     """
-    return map_database(database_path, image_path, output_path, options or MappingOptions(), StageLog(on_event)).models
+    options = MappingOptions.given(options)
+    with quiet_colmap():
+        return map_database(database_path, image_path, output_path, options, StageLog(on_event)).models
 
 
 def map_database(

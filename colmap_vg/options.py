@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, fields
 from os import PathLike
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Self, get_args, get_origin, get_type_hints
 
 from colmap_vg.errors import OptionError
 
@@ -22,6 +22,24 @@ def _number(default: float, low: float, high: float = float("inf")) -> Any:
 
 class _Checked:
     """Checks literals, booleans, integers and ranges of a frozen dataclass's fields."""
+
+    @classmethod
+    def given(cls, options: Self | None) -> Self:
+        """The options, or the defaults for None.
+
+        Raises
+        ------
+        OptionError
+            They are of another kind, for instance a dict or pycolmap's.
+        """
+        if options is None:
+            return cls()
+        if not isinstance(options, cls):
+            hint = (
+                f"write {cls.__name__}(**options)" if isinstance(options, dict) else f"make a colmap_vg.{cls.__name__}"
+            )
+            raise OptionError(f"options must be a {cls.__name__}, found a {type(options).__name__}: {hint}")
+        return options
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))

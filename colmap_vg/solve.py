@@ -99,7 +99,7 @@ def solve_view_graph(
         In the graph's order of images and edges, the largest part as component 0. An unsolvable graph gives a
         solution with no registered image, status ``unsolvable`` and the reason in its message.
     """
-    options = options or SolveOptions()
+    options = SolveOptions.given(options)
     ledger = Ledger(graph)
     initial = _initial_rotations(graph, initial_rotations)
     unsolved = np.ones(graph.num_images, dtype=bool)

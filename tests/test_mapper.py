@@ -314,3 +314,16 @@ def test_the_work_folder_holds_nothing_afterwards(noisy: tuple[Path, pycolmap.Re
 def test_a_database_of_one_trivial_rig_per_camera_is_fine(tmp_path: Path) -> None:
     make_database(tmp_path / "a.db", num_images=4, num_points=60, camera_per_image=True)
     check_database(tmp_path / "a.db")
+
+
+def test_library_calls_are_quiet_and_leave_the_log_s_level(
+    noisy: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 0
+    try:
+        view_graph_mapping(noisy[0], None, tmp_path / "out")
+        assert pycolmap.logging.minloglevel == 0
+    finally:
+        pycolmap.logging.minloglevel = level
+    assert capfd.readouterr().err == ""

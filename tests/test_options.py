@@ -39,3 +39,10 @@ def test_presets_grow_and_given_options_win():
     assert presets[2] == FeatureOptions()
     given = FeatureOptions.of_quality("low", max_image_size=500, matching="spatial", random_seed=3)
     assert given == FeatureOptions(max_image_size=500, max_num_features=counts[0], matching="spatial", random_seed=3)
+
+
+@pytest.mark.parametrize("wrong", [{"overwrite": True}, SolveOptions(), 3])
+def test_options_of_another_kind_are_named(wrong: object) -> None:
+    with pytest.raises(ColmapVgError, match=f"must be a MappingOptions, found a {type(wrong).__name__}"):
+        MappingOptions.given(wrong)  # type: ignore[arg-type]
+    assert MappingOptions.given(None) == MappingOptions()

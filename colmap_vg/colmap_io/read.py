@@ -44,7 +44,7 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
     DatabaseError
         The file cannot be read or is damaged.
     """
-    graph, _ = read_with_caveats(database_path, options or ReadOptions())
+    graph, _ = read_with_caveats(database_path, ReadOptions.given(options))
     return graph
 
 

@@ -74,7 +74,7 @@ def extract_and_match(
     OptionError
         The camera model is unknown, or does not take so many parameters.
     """
-    options, log = options or FeatureOptions(), log or StageLog()
+    options, log = FeatureOptions.given(options), log or StageLog()
     names, skipped = check_photographs(image_path, options, log)
     names, unreadable = extract_features(image_path, database_path, names, options, log)
     num_pairs = match_features(database_path, options, log)
