@@ -280,6 +280,8 @@ def _read(database_path: str | PathLike[str], options: MappingOptions, log: Stag
         if not options.ba_refine_focal_length:
             # Who keeps bundle adjustment from focal lengths wants them as they are.
             read = replace(read, trust_focal_lengths="always")
+        if not options.ba_refine_extra_params:
+            read = replace(read, find_distortion=False)
         graph, caveats = read_with_caveats(database_path, read)
         for caveat in caveats:
             log.warn(caveat)

@@ -64,6 +64,7 @@ class ReadOptions(_Checked):
 
     min_num_inliers: int = _number(15, 5)  # matches; edges with fewer are in the graph but not used
     trust_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: decided from the two-view geometries
+    find_distortion: bool = True  # a radial term for cameras of a radial model that have no distortion, if matches tell
     max_num_inliers_per_edge: int = _number(0, 0)  # matches kept as bearings per edge, spread over the image; 0: all
     excluded_pairs_path: str | PathLike[str] | None = None  # file with two image names a line: pairs not to be used
     trusted_pairs_path: str | PathLike[str] | None = None  # the same: pairs that no filter may drop

@@ -60,6 +60,9 @@ class ViewGraph:
         `EdgeVerdict` words given on reading; edges other than ``kept`` and ``rotation_only`` are not solved with.
     trusted : (m,) bool array or None
         Edges that no filter may drop, on the user's word.
+    found_radial_terms : (c,) array or None
+        Radial terms, at the database's focal lengths, of cameras that the database tells no distortion of. Bearings are
+        taken with them.
     verified_anew : (m,) bool array or None
         Pairs whose matches or configuration are not those of the database, which did not explain each other.
     planar : (m,) bool array or None
@@ -90,6 +93,7 @@ class ViewGraph:
     camera_radial: BoolArray | None = field(default=None, kw_only=True)
     read_verdicts: NDArray[np.str_] | None = field(default=None, kw_only=True)
     trusted: BoolArray | None = field(default=None, kw_only=True)
+    found_radial_terms: Array | None = field(default=None, kw_only=True)
     verified_anew: BoolArray | None = field(default=None, kw_only=True)
     planar: BoolArray | None = field(default=None, kw_only=True)
     triangulation_angles: Array | None = field(default=None, kw_only=True)
@@ -162,6 +166,7 @@ class ViewGraph:
             "trusted": (m,),
             "planar": (m,),
             "verified_anew": (m,),
+            "found_radial_terms": (c,),
             "triangulation_angles": (m,),
             "edge_information": (m, 5, 5),
             "inlier_offsets": (m + 1,),
@@ -246,6 +251,7 @@ _KINDS: dict[str, type] = {
     "trusted": np.bool_,
     "planar": np.bool_,
     "verified_anew": np.bool_,
+    "found_radial_terms": np.float64,
     "triangulation_angles": np.float64,
     "edge_information": np.float64,
     "inlier_offsets": np.int64,

@@ -8,6 +8,7 @@ import pytest
 from synthetic_databases import centers, look_at, make_database
 
 from colmap_vg import MappingOptions, align_positions, read_view_graph
+from colmap_vg.colmap_io.distortion import undistorted
 from colmap_vg.mapper import map_database
 from colmap_vg.stages import StageLog
 
@@ -60,6 +61,7 @@ def write_room(
                     matches = np.stack([a, b], axis=1).astype(np.uint32)
                     wrong = rng.random(len(a)) < 0.05
                     matches[wrong, 1] = rng.integers(len(keypoints[j]), size=int(wrong.sum()))
+                    database.write_matches(i + 1, j + 1, matches)
                     geometry = pycolmap.estimate_two_view_geometry(stored, keypoints[i], stored, keypoints[j], matches)
                     database.write_two_view_geometry(i + 1, j + 1, geometry)
     return p
@@ -102,6 +104,43 @@ def test_a_wrong_focal_length_that_must_stay_stays_with_a_warning(tmp_path: Path
     assert "not the 800.0 px" in told
     free = map_database(tmp_path / "a.db", None, tmp_path / "free", MappingOptions(), StageLog())
     assert abs(free.models[0].camera(1).mean_focal_length() - 600.0) < 6.0
+
+
+@pytest.mark.parametrize(
+    ("focal", "term", "prior"), [(600.0, -0.2, True), (600.0, -0.2, False), (900.0, -0.2, True), (900.0, 0.0, True)]
+)
+def test_distortion_that_nobody_told_is_found(focal: float, term: float, prior: bool, tmp_path: Path) -> None:
+    lens = camera("SIMPLE_RADIAL", (focal, 600.0, 450.0, term))
+    stored = camera("SIMPLE_RADIAL", (focal if prior else 1.2 * WIDTH, 600.0, 450.0, 0.0))
+    stored.has_prior_focal_length = prior
+    truth = write_room(tmp_path / "a.db", lens, stored)
+    log = StageLog()
+    result = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log)
+    ids = sorted(result.models[0].reg_image_ids())
+    assert ids == list(range(1, NUM_IMAGES + 1))
+    errors, _ = align_positions(centers(result.models[0], ids), truth)
+    assert errors.mean() < 0.006 * 1.5
+    found = result.models[0].camera(1)
+    assert abs(found.params[3] - term) < 0.01
+    assert abs(found.params[0] / focal - 1.0) < 0.01
+    assert any("tells no distortion" in warning for warning in log.warnings) == (term != 0.0)
+
+
+def test_distortion_is_not_looked_for_where_it_must_stay(tmp_path: Path) -> None:
+    stored = camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, 0.0))
+    write_room(tmp_path / "a.db", camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, -0.1)), stored)
+    options = MappingOptions(ba_refine_extra_params=False, ba_refine_focal_length=False)
+    result = map_database(tmp_path / "a.db", None, tmp_path / "out", options, StageLog())
+    assert list(result.models[0].camera(1).params) == list(stored.params)
+
+
+@pytest.mark.parametrize("kappa", [-0.3, -0.05, 0.0, 0.2])
+def test_undistorted_points_distort_back(kappa: float) -> None:
+    u = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
+    r = np.linalg.norm(u, axis=1, keepdims=True)
+    assert np.allclose(undistorted(u * (1.0 + kappa * r**2), kappa), u, atol=1e-9)
+    if kappa < 0:
+        assert np.isnan(undistorted(np.array([[0.0, 5.0]]), kappa)).all()
 
 
 @pytest.mark.parametrize(("model", "odd"), [("FULL_OPENCV", True), ("OPENCV", False)])

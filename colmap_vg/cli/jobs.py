@@ -138,7 +138,7 @@ def _solve(
         raise MappingError(f"no pose could be solved from {database_path}: {solution.message}")
     with log.stage("write"), work_folder(output_path, overwrite) as work:
         staged = stage_models(work, int(solution.component.max(initial=-1)) + 1)
-        with loaded_cache(database_path, work, read.min_num_inliers) as (cache, _):
+        with loaded_cache(database_path, work, read.min_num_inliers, graph=graph) as (cache, _):
             for component, folder in enumerate(staged):
                 write_model(reconstruction_from_solution(cache, solution, graph, component), folder)
         log.result(", ".join(map(str, publish_models(staged, output_path))))

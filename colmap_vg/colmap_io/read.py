@@ -7,6 +7,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, has_radial_term, with_focal_scale
+from colmap_vg.colmap_io.distortion import with_found_distortion
 from colmap_vg.colmap_io.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.relative_poses import relative_poses
@@ -51,12 +52,18 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
 @single_threaded_blas
 def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) -> tuple[ViewGraph, tuple[str, ...]]:
     """The viewing graph, and what was changed or could not be decided on reading, one sentence each."""
-    tables, changed = with_own_geometries(read_tables(database_path), options.random_seed)
+    tables = read_tables(database_path)
+    terms = np.zeros(len(tables.cameras))
+    if options.find_distortion:
+        tables, terms = with_found_distortion(tables, database_path)
+    tables, changed = with_own_geometries(tables, options.random_seed, terms != 0.0)
     focals = decide_focal_lengths(tables, options)
-    return _graph(tables, focals, changed, options), (*tables.caveats, *focals.caveats)
+    return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
 
 
-def _graph(tables: DatabaseTables, focals: FocalDecision, changed: BoolArray, options: ReadOptions) -> ViewGraph:
+def _graph(
+    tables: DatabaseTables, focals: FocalDecision, changed: BoolArray, terms: Array, options: ReadOptions
+) -> ViewGraph:
     cameras = [with_focal_scale(c, s) for c, s in zip(tables.cameras, focals.scales, strict=True)]
     offsets, matches, bearings1, bearings2 = _rays_of_matches(tables, cameras)
     geometry = relative_poses(
@@ -84,6 +91,7 @@ def _graph(tables: DatabaseTables, focals: FocalDecision, changed: BoolArray, op
         camera_radial=np.array([has_radial_term(c) for c in cameras], dtype=bool),
         read_verdicts=verdicts,
         trusted=trusted if trusted.any() else None,
+        found_radial_terms=terms if terms.any() else None,
         verified_anew=changed if changed.any() else None,
         planar=geometry.planar,
         triangulation_angles=geometry.angles,

@@ -40,7 +40,8 @@ def loaded_cache(
     without_pairs : sequence of (int, int)
         Image ids of pairs whose matches are left out.
     graph : ViewGraph, optional
-        As read from the database: the matches of pairs that were verified anew take the place of the database's.
+        As read from the database: the matches of pairs that were verified anew take the place of the database's, and
+        radial terms that were found bend its cameras.
 
     Yields
     ------
@@ -59,6 +60,7 @@ def loaded_cache(
             replaced: dict[int, int] = {}
             if graph is not None:
                 _replace_matches(copy, graph)
+                _bend_cameras(copy, graph)
             if without_pairs:
                 _delete_pairs(copy, without_pairs)
             if shared:
@@ -90,6 +92,16 @@ def _replace_matches(copy: Path, graph: ViewGraph) -> None:
         rows.append((len(matches), matches.tobytes(), config, pair_id))
     with closing(sqlite3.connect(copy)) as connection, connection:
         connection.executemany("UPDATE two_view_geometries SET rows = ?, data = ?, config = ? WHERE pair_id = ?", rows)
+
+
+def _bend_cameras(copy: Path, graph: ViewGraph) -> None:
+    """Give cameras the radial terms that were found on reading."""
+    if graph.found_radial_terms is None or graph.camera_ids is None:
+        return
+    with pycolmap.Database.open(copy) as database:
+        for camera_id, term in zip(graph.camera_ids.tolist(), graph.found_radial_terms.tolist(), strict=True):
+            if term:
+                database.update_camera(with_radial_term(database.read_camera(camera_id), term))
 
 
 def _delete_pairs(copy: Path, pairs: Sequence[tuple[int, int]]) -> None:

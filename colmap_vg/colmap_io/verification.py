@@ -41,7 +41,9 @@ FAR = 1e12
 UNDEFINED, DEGENERATE, CALIBRATED, UNCALIBRATED, WATERMARK = 0, 1, 2, 3, 7
 
 
-def with_own_geometries(tables: DatabaseTables, seed: int) -> tuple[DatabaseTables, BoolArray]:
+def with_own_geometries(
+    tables: DatabaseTables, seed: int, expected: BoolArray | None = None
+) -> tuple[DatabaseTables, BoolArray]:
     """Tables whose matrices explain their matches, or are missing.
 
     Parameters
@@ -49,6 +51,8 @@ def with_own_geometries(tables: DatabaseTables, seed: int) -> tuple[DatabaseTabl
     tables : DatabaseTables
     seed : int
         Of the verification.
+    expected : (c,) bool array, optional
+        Cameras whose pairs are known to need it, and need no caveat.
 
     Returns
     -------
@@ -57,7 +61,7 @@ def with_own_geometries(tables: DatabaseTables, seed: int) -> tuple[DatabaseTabl
     changed : (m,) bool array
         Pairs whose configuration or matches are not those of the database.
     """
-    straight, _ = undistorted_keypoints(tables)
+    straight, valid = undistorted_keypoints(tables)
     raw = np.concatenate([*tables.keypoints, np.zeros((0, 2))]).astype(np.float64)
     judged = ~np.isin(tables.configs, (DEGENERATE, WATERMARK)) & (np.diff(tables.offsets) >= MIN_NUM_REFITTED)
     unbelieved = np.flatnonzero(judged & ~_explained(tables, (raw, straight)))
@@ -66,7 +70,9 @@ def with_own_geometries(tables: DatabaseTables, seed: int) -> tuple[DatabaseTabl
         return tables, changed
     changed[unbelieved] = True
     rows, offsets = rows_of_segments(tables.offsets, unbelieved)
-    points1, points2 = (straight[tables.matched_keypoints(rows, unbelieved, offsets, side)] for side in (0, 1))
+    first, second = (tables.matched_keypoints(rows, unbelieved, offsets, side) for side in (0, 1))
+    seen = valid[first] & valid[second]
+    points1, points2, offsets = straight[first[seen]], straight[second[seen]], segment_subset(offsets, seen)
     F = estimate_fundamental_from_inliers(offsets, points1, points2)
     agree = np.abs(epipolar_distances(F, offsets, points1, points2)) <= MAX_ERROR_PX
     shares = segment_sums(offsets, agree.astype(float)) / np.maximum(np.diff(offsets), 1)
@@ -93,6 +99,8 @@ def with_own_geometries(tables: DatabaseTables, seed: int) -> tuple[DatabaseTabl
         found = _verified(found, doubtful, seed)
         after = int(np.diff(found.offsets)[doubtful].sum())
         caveat += f" In {len(doubtful)} of them matches look unverified: {before - after} of {before} were wrong."
+    if expected is not None and expected[tables.camera_idx[tables.pairs[unbelieved]]].any(axis=1).all():
+        return found, changed
     return replace(found, caveats=(*tables.caveats, caveat)), changed
 
 
@@ -140,12 +148,17 @@ def _verified(tables: DatabaseTables, pairs: IntArray, seed: int) -> DatabaseTab
     kept = [tables.matches[a:b] for a, b in zip(tables.offsets[:-1], tables.offsets[1:], strict=True)]
     configs = tables.configs.copy()
     matrices = {name: getattr(tables, name).copy() for name in ("E", "F", "H")}
+    pixels, valid = undistorted_keypoints(tables)
+    starts = np.concatenate([[0], np.cumsum([len(k) for k in tables.keypoints])])
+    pinholes = [_pinhole(lens) for lens in tables.cameras]
     for pair in pairs.tolist():
-        i, j = tables.pairs[pair].tolist()
-        lens1, lens2 = (tables.cameras[tables.camera_idx[image]] for image in (i, j))
-        points1, points2 = (tables.keypoints[image].astype(np.float64) for image in (i, j))
+        images = tables.pairs[pair].tolist()
+        points = [pixels[starts[image] : starts[image + 1]] for image in images]
+        seen = [valid[starts[image] : starts[image + 1]] for image in images]
+        matches = kept[pair][seen[0][kept[pair][:, 0]] & seen[1][kept[pair][:, 1]]]
+        first, second = (pinholes[tables.camera_idx[image]] for image in images)
         geometry = pycolmap.estimate_two_view_geometry(
-            lens1, points1, lens2, points2, kept[pair].astype(np.uint32), options
+            first, np.nan_to_num(points[0]), second, np.nan_to_num(points[1]), matches.astype(np.uint32), options
         )
         kept[pair] = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
         configs[pair] = int(geometry.config) if len(kept[pair]) >= MIN_NUM_MATCHES else DEGENERATE
@@ -154,3 +167,15 @@ def _verified(tables: DatabaseTables, pairs: IntArray, seed: int) -> DatabaseTab
             matrix[pair] = np.nan if value is None else value
     offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
     return replace(tables, matches=np.concatenate(kept), offsets=offsets, configs=configs, **matrices)
+
+
+def _pinhole(lens: "pycolmap.Camera") -> "pycolmap.Camera":
+    """The camera that undistorted keypoints are of."""
+    K = calibration_matrix(lens)
+    return pycolmap.Camera(
+        model="PINHOLE",
+        width=lens.width,
+        height=lens.height,
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        has_prior_focal_length=lens.has_prior_focal_length,
+    )
