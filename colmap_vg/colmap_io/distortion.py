@@ -11,8 +11,8 @@ import sqlite3
 from dataclasses import replace
 from os import PathLike
 
-import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import has_radial_term, with_radial_term
@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-COARSE, FINE = np.array([-0.3, -0.2, -0.1, 0.0, 0.12]), np.linspace(-0.08, 0.08, 9)
+COARSE, FINE = np.array([-0.3, -0.2, -0.1, 0.0, 0.12]), np.linspace(-0.06, 0.06, 7)
 MAX_PAIRS, PAIRS_PER_IMAGE, MAX_MATCHES, MIN_MATCHES = 16, 3, 200, 30
-MAX_ERROR_PX = 2.0
-MIN_GAIN = 1.05
-"""Matches that agree under a lens over those that agree without distortion: 1.10 to 1.22 on wide views with a radial
-term of -0.1 or less, and 1.02 at most on photographs whose lenses bend little."""
+MAX_ERROR_PX, MAX_NUM_TRIALS = 2.0, 300
+MIN_GAIN = 1.03
+"""Matches that agree under a lens over those that agree without distortion: 1.06 to 1.22 on wide views with a radial
+term of -0.1 or less, and 1.012 at most on photographs whose lenses bend little."""
 NUM_NEWTON = 30
 FOLD = 0.98
 """Of the largest radius that a lens of negative term reaches: pixels beyond it have no ray."""
@@ -85,13 +85,13 @@ def _found_term(tables: DatabaseTables, database_path: str | PathLike[str], imag
         for pair, rows in zip(pairs, matches, strict=True)
     ]
     counts = [_num_agreeing(points, kappa) for kappa in COARSE]
-    best = float(COARSE[int(np.argmax(counts))])
-    without = counts[int(np.flatnonzero(COARSE == 0.0)[0])]
-    if best == 0.0 or max(counts) < MIN_GAIN * without:
+    best, without = float(COARSE[int(np.argmax(counts))]), max(counts[int(np.flatnonzero(COARSE == 0.0)[0])], 1)
+    if best == 0.0:
         return 0.0, 1.0
     fine = best + FINE
     counts = [_num_agreeing(points, kappa) for kappa in fine]
-    return float(fine[int(np.argmax(counts))]), max(counts) / max(without, 1)
+    gain = max(counts) / without
+    return (float(fine[int(np.argmax(counts))]), gain) if gain >= MIN_GAIN else (0.0, 1.0)
 
 
 def _matches_to_ask(
@@ -162,13 +162,16 @@ def _centered(tables: DatabaseTables, image: int, rows: IntArray) -> tuple[Array
 
 def _num_agreeing(points: list[list[tuple[Array, float]]], kappa: float) -> int:
     """Matches of all pairs that agree with their pair's fundamental matrix once they are undistorted."""
+    options = pycolmap.RANSACOptions(
+        max_error=MAX_ERROR_PX, min_num_trials=30, max_num_trials=MAX_NUM_TRIALS, random_seed=0
+    )
     total = 0
     for (x1, half1), (x2, half2) in points:
         u1, u2 = half1 * undistorted(x1, kappa), half2 * undistorted(x2, kappa)
         seen = np.isfinite(u1).all(axis=1) & np.isfinite(u2).all(axis=1)
         if seen.sum() >= MIN_MATCHES // 2:
-            _, inside = cv2.findFundamentalMat(u1[seen], u2[seen], cv2.USAC_MAGSAC, MAX_ERROR_PX, 0.999, 500)
-            total += 0 if inside is None else int(inside.sum())
+            found = pycolmap.estimate_fundamental_matrix(u1[seen], u2[seen], options)
+            total += 0 if found is None else int(found["num_inliers"])
     return total
 
 
