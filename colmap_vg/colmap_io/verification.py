@@ -13,6 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import calibration_matrix
+from colmap_vg.colmap_io.relative_poses import CALIBRATED, DEGENERATE, UNCALIBRATED, WATERMARK
 from colmap_vg.colmap_io.tables import DatabaseTables
 from colmap_vg.colmap_io.undistortion import undistorted_keypoints
 from colmap_vg.geometry import so3
@@ -38,7 +39,8 @@ MATCHES_LOOKED_AT = 100
 MIN_NUM_MATCHES, MIN_NUM_REFITTED = 15, 8
 FAR = 1e12
 """Pixels; where a matrix is missing or tells nothing of a match."""
-UNDEFINED, DEGENERATE, CALIBRATED, UNCALIBRATED, WATERMARK = 0, 1, 2, 3, 7
+UNDEFINED = 0
+"""COLMAP's configuration of pairs that nobody verified."""
 
 
 def with_own_geometries(
