@@ -37,6 +37,8 @@ the heaviest in 98; but it is a sample of the evidence only, and where likelihoo
 BACKBONE_EDGES = 2
 NUM_GROUPS = 10
 """Of edges with like likelihoods, each as many, whose shares of agreement with the first candidate are learned."""
+TELLING_LOG_ODDS = 3.0
+"""From the least to the most likely edges: where likelihoods tell so much, only each image's heaviest edges count."""
 VOTES = ((20, 4.0), (20, 10.0), (20, 1.0), (10, 4.0), (6, 4.0))
 """Starts by votes: how many of each image's heaviest edges vote, and up to which likelihood over the median's."""
 RANDOM_VOTES, NUM_RANDOM_STARTS, RANDOM_SPREAD, MAX_EDGES_OF_STARTS = (20, 8), 8, 0.5, 60_000
@@ -213,6 +215,8 @@ class _Search:
         skeleton = np.where(self._skeleton, self._capped, 0.0)
         first = int(np.argmax(agree @ skeleton))
         odds = learned_log_odds(self._likelihoods, self._agree[first])
+        if np.ptp(odds) >= TELLING_LOG_ODDS:
+            odds = np.where(self._skeleton, odds, 0.0)
         by_odds = agree @ odds / odds.sum() if odds.any() else of_all
         winner = int(np.lexsort((-of_all, -by_odds))[0])
         best, lead, apart = self._candidates[winner], 1.0, np.zeros(self.num_images, dtype=bool)
