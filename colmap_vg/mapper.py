@@ -27,7 +27,7 @@ from colmap_vg.mapping.build import (
     extract_colors,
 )
 from colmap_vg.mapping.pair_agreement import PairRotations
-from colmap_vg.mapping.second_opinion import PointEvidence, point_evidence
+from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
 from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
@@ -39,10 +39,6 @@ from colmap_vg.view_graph import ViewGraph
 SAME_LENS_COST = 0.8
 """Share of its cost that bundle adjustment must leave when cameras that shared a calibration get their own: 0.98 to
 0.99 was left where there was one lens and images were strong, 0.89 where they were weak."""
-CLEARLY_MORE, MIN_SHARE_EXPLAINED = 1.2, 0.8
-"""Share of what should be seen that is, over that in another arrangement of the images, which settles between them: 1.5
-to 2.5 where one was folded and part of the scene did not repeat itself, 1.0 between two folds. An arrangement whose
-points explain much fewer observations than another's does not count."""
 ROUGH_MATCHES = 100
 """Of a pair, for solutions that points are to compare."""
 FALSE_PAIRS = (EdgeVerdict.EXCLUDED, EdgeVerdict.ROTATION_OUTLIER)
@@ -230,22 +226,21 @@ def _second_opinion(
         ]
         shown = ", ".join(f"{evidence.share_seen:.2f}" for evidence in found)
         log.result(f"of the points that images should see, so large a share is seen in each arrangement: {shown}")
-        most = max(evidence.num_observations for evidence in found)
-        shares = [e.share_seen if e.num_observations >= MIN_SHARE_EXPLAINED * most else 0.0 for e in found]
-        best = int(np.argmax(shares))
-        if shares[best] < CLEARLY_MORE * shares[0]:
-            best = 0
-        settled = all(shares[best] >= CLEARLY_MORE * share for k, share in enumerate(shares) if k != best)
+        best, settled = best_arrangement(found)
         chosen, in_doubt = solution, None if settled else solution.in_doubt
         if best > 0:
             chosen = solve_view_graph(graph, _solve_options(options), solution.arrangements[best])
+            for caveat in chosen.caveats:
+                log.warn(caveat)
             log.warn(
                 "Pairs agree with another arrangement of the images more, but there images do not see what they should:"
-                f" {shares[best]:.2f} of it is seen in the arrangement that is used, {shares[0]:.2f} in the other."
+                f" {found[best].share_seen:.2f} of it is seen in the arrangement that is used,"
+                f" {found[0].share_seen:.2f} in the other."
             )
         elif settled and solution.in_doubt is not None:
             log.warn(
-                f"The points settle between them: this arrangement's images see {shares[0]:.2f} of what they should."
+                "The points settle between them: this arrangement's images see"
+                f" {found[0].share_seen:.2f} of what they should."
             )
         status, message = described(chosen.image_verdicts, chosen.converged, chosen.agreement, in_doubt is not None)
         return replace(chosen, in_doubt=in_doubt, status=status, message=message)

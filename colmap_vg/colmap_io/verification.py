@@ -66,7 +66,8 @@ def with_own_geometries(
     straight, valid = undistorted_keypoints(tables)
     raw = np.concatenate([*tables.keypoints, np.zeros((0, 2))]).astype(np.float64)
     judged = ~np.isin(tables.configs, (DEGENERATE, WATERMARK)) & (np.diff(tables.offsets) >= MIN_NUM_REFITTED)
-    unbelieved = np.flatnonzero(judged & ~_explained(tables, (raw, straight)))
+    as_seen = (raw,) if np.array_equal(raw, straight) else (raw, straight)
+    unbelieved = np.flatnonzero(judged & ~_explained(tables, as_seen))
     changed = np.zeros(len(tables.pairs), dtype=bool)
     if len(unbelieved) == 0:
         return tables, changed
@@ -106,7 +107,7 @@ def with_own_geometries(
     return replace(found, caveats=(*tables.caveats, caveat)), changed
 
 
-def _explained(tables: DatabaseTables, pixels: tuple[Array, Array]) -> BoolArray:
+def _explained(tables: DatabaseTables, pixels: tuple[Array, ...]) -> BoolArray:
     """Pairs (m,) whose median match is near one of their matrices, on pixels as they are or undistorted."""
     every = np.arange(len(tables.pairs))
     thin = evenly_thinned(tables.offsets, MATCHES_LOOKED_AT)

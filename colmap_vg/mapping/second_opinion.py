@@ -5,6 +5,7 @@ But images that now stand side by side should see the same points, and see them 
 (missing correspondences: Zach et al., CVPR 2008; Jiang et al., CVPR 2012).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,10 @@ from colmap_vg.options import MappingOptions
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+CLEARLY_MORE, MIN_SHARE_EXPLAINED = 1.2, 0.8
+"""Share of what should be seen that is, over that in another arrangement of the images, which settles between them: 1.5
+to 2.5 where one was folded and part of the scene did not repeat itself, 1.0 between two folds. An arrangement whose
+points explain much fewer observations than another's does not count."""
 MAX_NUM_POINTS = 3000
 """Points that are looked for in all images, the same share of each track length."""
 MIN_TRACK_LENGTH = 3
@@ -91,6 +96,29 @@ def point_evidence(
     centers = np.array([reconstruction.image(i).projection_center() for i in image_ids])
     expected = _in_frame(reconstruction, image_ids, xyz) & _seen_from_near(xyz, centers, sees)
     return PointEvidence(sum(len(seen) for _, seen in tracks), int(expected.sum()), int((expected & sees).sum()))
+
+
+def best_arrangement(found: Sequence[PointEvidence]) -> tuple[int, bool]:
+    """The arrangement that points speak for, and whether they settle it.
+
+    Parameters
+    ----------
+    found : sequence of PointEvidence
+        Of two arrangements or more; the first is the one that pairs prefer, and stays where points are not clear.
+
+    Returns
+    -------
+    best : int
+    settled : bool
+        Whether clearly more of what should be seen is seen in it than in every other one. Never where nothing is.
+    """
+    most = max(evidence.num_observations for evidence in found)
+    shares = [e.share_seen if e.num_observations >= MIN_SHARE_EXPLAINED * most else 0.0 for e in found]
+    best = int(np.argmax(shares))
+    if shares[best] < CLEARLY_MORE * shares[0]:
+        best = 0
+    others = [share for k, share in enumerate(shares) if k != best]
+    return best, shares[best] > 0.0 and shares[best] >= CLEARLY_MORE * max(others)
 
 
 def _in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xyz: Array) -> BoolArray:

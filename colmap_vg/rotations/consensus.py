@@ -11,7 +11,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.geometry import so3
@@ -210,6 +209,8 @@ class _Search:
 
     def ranked(self) -> tuple[Array, float, BoolArray, tuple[Array, ...]]:
         """The best candidate, its lead over the nearest other solution, where that one differs, and its rivals."""
+        if len(self._candidates) == 1:
+            return self._candidates[0], 1.0, np.zeros(self.num_images, dtype=bool), ()
         agree = np.array(self._agree, dtype=np.float64)
         of_all = agree @ self._capped / self._capped.sum()
         skeleton = np.where(self._skeleton, self._capped, 0.0)
@@ -268,6 +269,8 @@ def learned_log_odds(likelihoods: Array, agree: BoolArray) -> Array:
     (m,) array
         Never falling with the likelihood, and 0 where less than half agree.
     """
+    from scipy.optimize import isotonic_regression  # a tenth of a second that clear graphs do without
+
     place = np.searchsorted(np.sort(likelihoods), likelihoods)  # equal likelihoods go together
     group = np.minimum(NUM_GROUPS * place // max(len(place), 1), NUM_GROUPS - 1)
     total, right = np.bincount(group, minlength=NUM_GROUPS), np.bincount(group, agree, NUM_GROUPS)

@@ -13,7 +13,7 @@ from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from
 from colmap_vg.colmap_io.synthetic_database import write_synthetic_database
 from colmap_vg.geometry import so3
 from colmap_vg.mapper import map_database
-from colmap_vg.mapping.second_opinion import NEAR_DEG, point_evidence
+from colmap_vg.mapping.second_opinion import NEAR_DEG, PointEvidence, best_arrangement, point_evidence
 from colmap_vg.stages import StageLog
 
 
@@ -48,6 +48,25 @@ def test_what_should_be_seen_is_counted_as_by_loops(tmp_path: Path) -> None:
                 seen += i in images
     assert (found.num_observations, found.num_expected, found.num_seen) == (observations, expected, seen)
     assert expected > 50
+
+
+@pytest.mark.parametrize(
+    ("seen", "observations", "best", "settled"),
+    [
+        ((70, 40), (900, 1000), 0, True),
+        ((40, 70), (1000, 900), 1, True),
+        ((60, 65), (1000, 1000), 0, False),  # not clear: the pairs' choice stays, in doubt
+        ((40, 70, 65), (1000, 1000, 1000), 1, False),
+        ((40, 90), (1000, 500), 0, True),  # much fewer observations: does not count
+        ((0, 0), (0, 0), 0, False),  # no points tell nothing
+        ((0, 0), (1000, 1000), 0, False),
+    ],
+)
+def test_points_settle_what_they_tell_and_no_more(
+    seen: tuple[int, ...], observations: tuple[int, ...], best: int, settled: bool
+) -> None:
+    found = [PointEvidence(count, 100, share) for share, count in zip(seen, observations, strict=True)]
+    assert best_arrangement(found) == (best, settled)
 
 
 @pytest.mark.parametrize(("num_sides", "num_ground_points"), [(2, 60), (4, 60)])
