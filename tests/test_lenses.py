@@ -9,6 +9,7 @@ from synthetic_databases import centers, look_at, make_database
 
 from colmap_vg import MappingOptions, align_positions, read_view_graph
 from colmap_vg.colmap_io.distortion import undistorted
+from colmap_vg.colmap_io.reconstruction import loaded_cache
 from colmap_vg.mapper import map_database
 from colmap_vg.stages import StageLog
 
@@ -124,6 +125,17 @@ def test_distortion_that_nobody_told_is_found(focal: float, term: float, prior: 
     assert abs(found.params[3] - term) < 0.01
     assert abs(found.params[0] / focal - 1.0) < 0.01
     assert any("tells no distortion" in warning for warning in log.warnings) == (term != 0.0)
+
+
+def test_poses_without_points_have_the_lens_that_was_found(tmp_path: Path) -> None:
+    stored = camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, 0.0))
+    write_room(tmp_path / "a.db", camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, -0.2)), stored)
+    graph = read_view_graph(tmp_path / "a.db")
+    assert abs(graph.found_radial_terms[0] + 0.2) < 0.03
+    before = (tmp_path / "a.db").read_bytes()
+    with loaded_cache(tmp_path / "a.db", tmp_path, 15, graph=graph) as (cache, _):
+        assert cache.camera(1).params[3] == pytest.approx(graph.found_radial_terms[0])
+    assert (tmp_path / "a.db").read_bytes() == before
 
 
 def test_distortion_is_not_looked_for_where_it_must_stay(tmp_path: Path) -> None:

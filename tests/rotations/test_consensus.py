@@ -77,6 +77,14 @@ def test_folds_of_objects_with_equal_sides_never_lead_clearly(num_images, num_si
         assert found.lead < CLEAR_LEAD
 
 
+def test_heaviest_edges_decide_where_likelihoods_tell_much():
+    # By all edges the object's other side, which makes more pairs but weaker ones, wins.
+    noise = ObjectNoise(hardness=0.5, coherent_share=0.9)
+    scene = object_scene(149, 2524, noise, 510)
+    found = _solve(scene)
+    assert _errors_deg(found.cam_from_world_rotations, scene.cam_from_world_rotations).max() < 3.0
+
+
 def test_odds_are_learned_by_likelihood_and_never_fall():
     rng = np.random.default_rng(0)
     likelihoods = rng.uniform(0.0, 1.0, 2000)
