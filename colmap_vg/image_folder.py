@@ -16,6 +16,7 @@ from colmap_vg.errors import OutputError
 from colmap_vg.features.extraction import UNREADABLE, FeatureResult, check_photographs
 from colmap_vg.features.isolated import extract_features_apart, match_features_apart
 from colmap_vg.features.photographs import SkippedFile
+from colmap_vg.features.staging import readable_folder
 from colmap_vg.mapper import view_graph_mapping
 from colmap_vg.options import FeatureOptions, MappingOptions
 from colmap_vg.output_folder import WORK_NAME, lock_descriptors, output_lock, refuse_models, work_folder
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 DATABASE_NAME = "database.db"
 RECORD_NAME = "features.json"
+COPIES_NAME = "copies"
 
 
 def image_folder_mapping(
@@ -107,7 +109,9 @@ def make_database(
             f"{finished} is there already, and colmap-vg did not make it here: map it with "
             f"`colmap-vg mapper`, choose another --output_path, or replace it with --overwrite"
         )
-    names, skipped = check_photographs(image_path, options, log)
+    inside = (Path(output_path),) if Path(output_path).resolve() != Path(image_path).resolve() else ()
+    photographs, skipped = check_photographs(image_path, options, log, inside)
+    names = [photograph.name for photograph in photographs]
     with work_folder(output_path, overwrite) as work:
         record, unfinished = _record(image_path, names, options), work / DATABASE_NAME
         same = resume and _read_record(record_path) == record
@@ -121,7 +125,8 @@ def make_database(
             log.warn(f"{work} was made from other photographs or with other options: features are extracted afresh")
         if not same:
             _start_afresh(finished, unfinished, record_path, record)
-        names, unreadable = extract_features_apart(image_path, unfinished, names, options, log, lock_descriptors())
+        with readable_folder(image_path, photographs, options, work / COPIES_NAME) as (folder, reading):
+            names, unreadable = extract_features_apart(folder, unfinished, names, reading, log, lock_descriptors())
         num_verified_pairs = match_features_apart(unfinished, options, log, lock_descriptors())
         try:
             unfinished.replace(finished)

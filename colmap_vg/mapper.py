@@ -24,8 +24,8 @@ from colmap_vg.mapping.build import (
     BuildResult,
     adjust_once_more,
     build_model,
-    extract_colors,
 )
+from colmap_vg.mapping.colors import extract_colors
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
 from colmap_vg.options import MappingOptions, SolveOptions

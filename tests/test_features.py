@@ -156,19 +156,16 @@ def test_given_calibration_is_a_prior_of_one_camera(tmp_path: Path, corner: Corn
     assert "400 x 360" in log.warnings[0]
 
 
-def test_masks_hide_features_and_missing_ones_are_named(tmp_path: Path, corner: Corner) -> None:
+def test_masks_hide_features(tmp_path: Path, corner: Corner) -> None:
     corner.write(tmp_path / "images")
-    write_jpeg(tmp_path / "images" / "unmasked.jpg", corner.images[0])
     (tmp_path / "images" / "masks").mkdir()
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, : WIDTH // 2] = 255
     for index in range(3):
         cv2.imwrite(str(tmp_path / "images" / "masks" / f"{index:02d}.jpg.png"), mask)
-    log = StageLog()
     options = FeatureOptions(mask_path=tmp_path / "images" / "masks", **QUICK)
-    result = extract_and_match(tmp_path / "images", tmp_path / "a.db", options, log)
+    result = extract_and_match(tmp_path / "images", tmp_path / "a.db", options)
     assert result.image_names == ("00.jpg", "01.jpg", "02.jpg")
-    assert [file.name for file in result.skipped] == ["unmasked.jpg"]
     for _, keypoints in database_rows(tmp_path / "a.db").values():
         assert len(keypoints) > 20
         assert keypoints[:, 0].max() < WIDTH // 2 + 1

@@ -6,7 +6,7 @@ however it was held, and nothing has to be rotated here.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -15,12 +15,23 @@ import numpy as np
 import pycolmap
 
 from colmap_vg.errors import ImageFolderError, OptionError
+from colmap_vg.features.masks import with_masks
 from colmap_vg.features.matching import match_features, restore_names
-from colmap_vg.features.photographs import MIN_IMAGES, SkippedFile, find_photographs, split_odd_sizes, split_unmasked
+from colmap_vg.features.photographs import (
+    MIN_IMAGES,
+    Photograph,
+    SkippedFile,
+    find_photographs,
+    split_odd_sizes,
+)
+from colmap_vg.features.staging import readable_folder
 from colmap_vg.options import FeatureOptions
 from colmap_vg.stages import StageLog
 
 UNREADABLE = "COLMAP cannot read it"
+
+NAMED_ALONE, LISTED = 2, 5
+"""Files skipped for one reason that have a warning each, and names that one warning lists."""
 
 IMAGES_PER_CALL = 8
 """Images per thread and call of pycolmap: progress is told between calls, and a call ends with idle threads."""
@@ -75,16 +86,27 @@ def extract_and_match(
         The camera model is unknown, or does not take so many parameters.
     """
     options, log = FeatureOptions.given(options), log or StageLog()
-    names, skipped = check_photographs(image_path, options, log)
-    names, unreadable = extract_features(image_path, database_path, names, options, log)
+    photographs, skipped = check_photographs(image_path, options, log)
+    names = [photograph.name for photograph in photographs]
+    copies = Path(f"{os.fspath(database_path)}-copies")
+    with readable_folder(image_path, photographs, options, copies) as (folder, reading):
+        names, unreadable = extract_features(folder, database_path, names, reading, log)
     num_pairs = match_features(database_path, options, log)
     return FeatureResult(tuple(names), (*skipped, *unreadable), num_pairs)
 
 
 def check_photographs(
-    image_path: str | PathLike[str], options: FeatureOptions, log: StageLog
-) -> tuple[list[str], list[SkippedFile]]:
-    """Names of the photographs that can be used, and the files that cannot; each of these is named as a warning.
+    image_path: str | PathLike[str], options: FeatureOptions, log: StageLog, exclude: Iterable[Path] = ()
+) -> tuple[list[Photograph], list[SkippedFile]]:
+    """The photographs that can be used, and the files that cannot; warnings say which and why.
+
+    Parameters
+    ----------
+    image_path : path
+    options : FeatureOptions
+    log : StageLog
+    exclude : iterable of Path
+        Folders that are not searched, beside that of the masks.
 
     Raises
     ------
@@ -95,26 +117,47 @@ def check_photographs(
     """
     _reader_options(options)
     with log.stage("photographs"):
-        names, skipped = _usable_photographs(image_path, options, log)
-        log.result(f"{len(names)} photographs" + (f", {len(skipped)} files skipped" if skipped else ""))
-    return names, skipped
+        photographs, skipped = _usable_photographs(image_path, options, log, tuple(exclude))
+        log.result(f"{len(photographs)} photographs" + (f", {len(skipped)} files skipped" if skipped else ""))
+    return photographs, skipped
 
 
 def _usable_photographs(
-    image_path: str | PathLike[str], options: FeatureOptions, log: StageLog
-) -> tuple[list[str], list[SkippedFile]]:
+    image_path: str | PathLike[str], options: FeatureOptions, log: StageLog, exclude: tuple[Path, ...]
+) -> tuple[list[Photograph], list[SkippedFile]]:
     listed = None if options.image_list_path is None else read_image_list(options.image_list_path)
-    exclude = () if options.mask_path is None else (Path(options.mask_path),)
+    masks = None if options.mask_path is None else Path(options.mask_path)
+    if masks is not None and masks.resolve() != Path(image_path).resolve():
+        exclude += (masks,)
     photographs, skipped = find_photographs(image_path, listed, exclude)
     photographs, odd = split_odd_sizes(photographs, options.camera_mode, bool(options.camera_params))
     skipped += odd
-    if options.mask_path is not None:
-        photographs, unmasked = split_unmasked(photographs, options.mask_path)
-        skipped += unmasked
-    for file in skipped:
-        log.warn(f"skipped {file.name}: {file.reason}")
+    if masks is not None:
+        photographs, spoilt = with_masks(photographs, image_path, masks)
+        skipped += spoilt
+    _warn_of_skipped(skipped, log)
+    whole = [photograph.name for photograph in photographs if masks is not None and photograph.mask is None]
+    if whole:
+        log.warn(f"{len(whole)} photographs have no mask in {masks}, and are used whole: {_listed(whole)}")
     _require_enough(len(photographs), image_path, skipped)
-    return [photograph.name for photograph in photographs], skipped
+    return photographs, skipped
+
+
+def _warn_of_skipped(skipped: Sequence[SkippedFile], log: StageLog) -> None:
+    """Warn of each file, or once of many that are skipped for one reason."""
+    names_by_reason: dict[str, list[str]] = {}
+    for file in skipped:
+        names_by_reason.setdefault(file.reason, []).append(file.name)
+    for reason, names in names_by_reason.items():
+        if len(names) > NAMED_ALONE:
+            log.warn(f"skipped {len(names)} files ({_listed(names)}): {reason.replace('it ', 'each ', 1)}")
+        else:
+            for name in names:
+                log.warn(f"skipped {name}: {reason}")
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
 
 
 def read_image_list(path: str | PathLike[str]) -> list[str]:

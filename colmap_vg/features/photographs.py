@@ -1,22 +1,22 @@
 """Which files of a folder are photographs that can be used, and why the others cannot.
 
-COLMAP decodes what it can of a damaged file and goes on: half of a truncated JPEG becomes a grey half image with wrong
-features, without a word. So the structure of JPEG and PNG files is checked before anything is extracted.
+Files that COLMAP cannot read as they are, and OpenCV can, are marked to be copied (`staging`).
 """
 
-import re
-import struct
-import zlib
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from colmap_vg.errors import ImageFolderError
+from colmap_vg.features.image_files import DamagedFileError, jpeg_size, png_header
 from colmap_vg.options import CameraMode
+from colmap_vg.pixels import decoded
 
 MIN_IMAGES = 3
 """Images; two views have no redundancy that could tell a right model from a wrong one."""
@@ -30,9 +30,8 @@ SUFFIXES = (
 )
 """File name endings that promise an image; a file with another one and unknown content is no photograph."""
 
-_STANDALONE = frozenset([0x01, *range(0xD0, 0xD8)])
-_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_AFTER_SCAN_DATA = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
+_HEIF_SUFFIXES = (".heic", ".heif")
+_FULL_SIXTEEN_BITS = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -45,11 +44,17 @@ class Photograph:
         Path relative to the image folder, with forward slashes, as COLMAP names images.
     width, height : int
         Pixels, as stored (before any EXIF orientation).
+    copied : bool
+        COLMAP cannot read the file as it is, and OpenCV can.
+    mask : Path or None
+        Its mask, where one is used.
     """
 
     name: str
     width: int
     height: int
+    copied: bool = False
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -58,10 +63,6 @@ class SkippedFile:
 
     name: str
     reason: str
-
-
-class _DamagedFileError(Exception):
-    """The file's structure is broken; the message is the reason for the user."""
 
 
 def find_photographs(
@@ -99,7 +100,7 @@ def find_photographs(
     photographs: list[Photograph] = []
     skipped: list[SkippedFile] = []
     for name in sorted(set(names)) if names is not None else _visible_files(folder, exclude):
-        found = _check(folder / name, name)
+        found = check_photograph(folder / name, name)
         if isinstance(found, Photograph):
             photographs.append(found)
         else:
@@ -148,46 +149,24 @@ def split_odd_sizes(
     return kept, skipped
 
 
-def split_unmasked(
-    photographs: Sequence[Photograph], mask_path: str | PathLike[str]
-) -> tuple[list[Photograph], list[SkippedFile]]:
-    """Leave out photographs without a usable mask, as COLMAP does, but say so.
-
-    The mask of ``folder/a.jpg`` is ``folder/a.jpg.png``, or ``folder/a.png``, and has the photograph's size.
-    """
-    masks = Path(mask_path)
-    if not masks.is_dir():
-        raise ImageFolderError(f"no such mask folder: {masks}; check --mask_path")
-    kept, skipped = [], []
-    for photograph in photographs:
-        candidates = (masks / f"{photograph.name}.png", (masks / photograph.name).with_suffix(".png"))
-        mask = next((candidate for candidate in candidates if candidate.is_file()), None)
-        if mask is None:
-            skipped.append(SkippedFile(photograph.name, f"it has no mask {candidates[0]}"))
-            continue
-        checked = _check(mask, str(mask))
-        if isinstance(checked, SkippedFile):
-            skipped.append(SkippedFile(photograph.name, f"of its mask {mask}: {checked.reason}"))
-        elif (checked.width, checked.height) != (photograph.width, photograph.height):
-            sizes = f"{checked.width} x {checked.height} pixels, not {photograph.width} x {photograph.height}"
-            skipped.append(SkippedFile(photograph.name, f"its mask {mask} is {sizes}"))
-        else:
-            kept.append(photograph)
-    return kept, skipped
-
-
 def _visible_files(folder: Path, exclude: Iterable[Path]) -> list[str]:
     excluded = {path.resolve() for path in exclude}
-    names = []
-    for path in folder.rglob("*"):
-        relative = path.relative_to(folder)
-        hidden = any(part.startswith(".") for part in relative.parts)
-        if not hidden and path.is_file() and not excluded.intersection(path.resolve().parents):
-            names.append(relative.as_posix())
+    names, entered = [], set[Path]()
+    # A folder that is reached twice, through a link, counts once: its photographs are the same.
+    for at, folders, files in os.walk(folder, followlinks=True):
+        real = Path(at).resolve()
+        if real in entered or real in excluded or excluded.intersection(real.parents):
+            folders.clear()
+            continue
+        entered.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        paths = [Path(at) / name for name in files if not name.startswith(".")]
+        names += [path.relative_to(folder).as_posix() for path in paths if path.is_file()]
     return sorted(names)
 
 
-def _check(path: Path, name: str) -> Photograph | SkippedFile:
+def check_photograph(path: Path, name: str) -> Photograph | SkippedFile:
+    """A file as a photograph of this name, or why it cannot be one."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -195,75 +174,36 @@ def _check(path: Path, name: str) -> Photograph | SkippedFile:
     except OSError as error:
         return SkippedFile(name, f"it cannot be read ({error.strerror})")
     try:
-        width, height = _size(path, data)
-    except _DamagedFileError as error:
+        photograph = _measured(path, name, data)
+    except DamagedFileError as error:
         return SkippedFile(name, str(error))
-    if min(width, height) < MIN_SIDE:
-        return SkippedFile(name, f"it has only {width} x {height} pixels")
-    return Photograph(name, width, height)
+    if min(photograph.width, photograph.height) < MIN_SIDE:
+        return SkippedFile(name, f"it has only {photograph.width} x {photograph.height} pixels")
+    return photograph
 
 
-def _size(path: Path, data: bytes) -> tuple[int, int]:
+def _measured(path: Path, name: str, data: bytes) -> Photograph:
     if not data:
-        raise _DamagedFileError("the file is empty")
+        raise DamagedFileError("the file is empty")
     if data.startswith(b"\xff\xd8"):
-        return _jpeg_size(data)
+        return Photograph(name, *jpeg_size(data))
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return _png_size(data)
-    if path.suffix.lower() not in SUFFIXES.split():
-        raise _DamagedFileError("it is no photograph")
+        width, height, bits = png_header(data)
+        return Photograph(name, width, height, bits == 16 and _is_dark(path))
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES.split():
+        raise DamagedFileError("it is no photograph")
     bitmap = pycolmap.Bitmap.read(path, False)
-    if bitmap is None:
-        raise _DamagedFileError("it cannot be decoded as an image")
-    return bitmap.width, bitmap.height
+    if bitmap is not None:
+        return Photograph(name, bitmap.width, bitmap.height, suffix in (".tif", ".tiff") and _is_dark(path))
+    pixels = decoded(data)
+    if pixels is None:
+        heif = "it is a HEIF file, which neither COLMAP nor OpenCV decodes: convert it to JPEG, as pillow-heif does"
+        raise DamagedFileError(heif if suffix in _HEIF_SUFFIXES else "it cannot be decoded as an image")
+    return Photograph(name, pixels.shape[1], pixels.shape[0], copied=True)
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Walk the markers of a JPEG file to its end (ITU-T T.81, annex B), and read the size from the frame header."""
-    size, position, scans = None, 2, 0
-    while True:
-        if position + 2 > len(data):
-            raise _DamagedFileError("the JPEG file is truncated")
-        if data[position] != 0xFF:
-            raise _DamagedFileError(f"the JPEG file is corrupt at byte {position}")
-        marker = data[position + 1]
-        position += 1 if marker == 0xFF else 2
-        if marker == 0xD9:
-            break
-        if marker == 0xFF or marker in _STANDALONE:
-            continue
-        length = int.from_bytes(data[position : position + 2], "big")
-        if length < 2 or marker < 0xC0:
-            raise _DamagedFileError(f"the JPEG file is corrupt at byte {position}")
-        if marker in _START_OF_FRAME and position + 7 <= len(data):
-            height, width = struct.unpack(">HH", data[position + 3 : position + 7])
-            size = (width, height)
-        position += length
-        if marker == 0xDA:
-            scans += 1
-            following = _AFTER_SCAN_DATA.search(data, position)
-            if following is None:
-                raise _DamagedFileError("the JPEG file is truncated")
-            position = following.end() - 2
-    if size is None or not scans:
-        raise _DamagedFileError("the JPEG file holds no image")
-    return size
-
-
-def _png_size(data: bytes) -> tuple[int, int]:
-    """Walk the chunks of a PNG file with their checksums (ISO/IEC 15948, clause 5)."""
-    position, size = 8, None
-    while position + 12 <= len(data):
-        length = int.from_bytes(data[position : position + 4], "big")
-        kind = data[position + 4 : position + 8]
-        end = position + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(data[position + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise _DamagedFileError(f"the PNG file is corrupt: wrong checksum at byte {position}")
-        if kind == b"IHDR":
-            size = struct.unpack(">II", data[position + 8 : position + 16])
-        if kind == b"IEND" and size is not None:
-            return size[0], size[1]
-        position = end
-    raise _DamagedFileError("the PNG file is truncated")
+def _is_dark(path: Path) -> bool:
+    """Whether the pixels have sixteen bits and leave the last of them unused, as data of twelve bits do."""
+    pixels = decoded(path.read_bytes())
+    return pixels is not None and pixels.dtype == np.uint16 and 0 < int(pixels.max()) < _FULL_SIXTEEN_BITS

@@ -5,8 +5,6 @@ that starts from rough poses needs many.
 """
 
 from dataclasses import dataclass
-from os import PathLike
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -143,27 +141,6 @@ def adjust_once_more(
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return share
-
-
-def extract_colors(
-    reconstruction: "pycolmap.Reconstruction", image_path: str | PathLike[str] | None, log: StageLog
-) -> None:
-    """Colours of points as the mean over their images; a caveat names the images that are missing."""
-    if image_path is None:
-        return
-    folder = Path(image_path)
-    missing = [
-        reconstruction.image(i).name
-        for i in reconstruction.reg_image_ids()
-        if not (folder / reconstruction.image(i).name).is_file()
-    ]
-    if missing:
-        log.warn(
-            f"{len(missing)} of {reconstruction.num_reg_images()} registered images are not in {folder}"
-            f" (first: {sorted(missing)[0]}); points seen only there stay black."
-        )
-    if len(missing) < reconstruction.num_reg_images():
-        reconstruction.extract_colors_for_all_images(folder)
 
 
 def _adjust(

@@ -1,0 +1,94 @@
+"""The structure of JPEG and PNG files.
+
+COLMAP decodes what it can of a damaged file and goes on: half of a truncated JPEG becomes a grey half image with wrong
+features, without a word. So the structure is checked before anything is extracted.
+"""
+
+import re
+import struct
+import zlib
+
+from colmap_vg.pixels import decoded
+
+_STANDALONE = frozenset([0x01, *range(0xD0, 0xD8)])
+_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_AFTER_SCAN_DATA = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
+_TAIL_BYTES, _LAST_COLUMNS = 64, 8
+"""Without the last bytes of its data a JPEG image changes in its last block, if the data reach so far."""
+
+
+class DamagedFileError(Exception):
+    """The file's structure is broken; the message is the reason for the user."""
+
+
+def jpeg_size(data: bytes) -> tuple[int, int]:
+    """Width and height from the frame header, after a walk through the markers of a JPEG file (ITU-T T.81, annex B).
+
+    Raises
+    ------
+    DamagedFileError
+        A marker is missing where one must be, or the data end before the image does.
+    """
+    size, position, scans = None, 2, 0
+    while True:
+        if position + 2 > len(data):
+            raise DamagedFileError("the JPEG file is truncated")
+        if data[position] != 0xFF:
+            raise DamagedFileError(f"the JPEG file is corrupt at byte {position}")
+        marker = data[position + 1]
+        position += 1 if marker == 0xFF else 2
+        if marker == 0xD9:
+            break
+        if marker == 0xFF or marker in _STANDALONE:
+            continue
+        length = int.from_bytes(data[position : position + 2], "big")
+        if length < 2 or marker < 0xC0:
+            raise DamagedFileError(f"the JPEG file is corrupt at byte {position}")
+        if marker in _START_OF_FRAME and position + 7 <= len(data):
+            height, width = struct.unpack(">HH", data[position + 3 : position + 7])
+            size = (width, height)
+        position += length
+        if marker == 0xDA:
+            scans += 1
+            following = _AFTER_SCAN_DATA.search(data, position)
+            if following is None:
+                if size is not None and _reaches_the_end(data):
+                    break
+                raise DamagedFileError("the JPEG file is truncated")
+            position = following.end() - 2
+    if size is None or not scans:
+        raise DamagedFileError("the JPEG file holds no image")
+    return size
+
+
+def _reaches_the_end(data: bytes) -> bool:
+    """Whether a JPEG file lacks its end marker only: without its last bytes the last block changes."""
+    whole, cut = (decoded(part + b"\xff\xd9") for part in (data, data[:-_TAIL_BYTES]))
+    if whole is None or cut is None or whole.shape != cut.shape:
+        return False
+    return bool((whole != cut)[-1, -_LAST_COLUMNS:].any())
+
+
+def png_header(data: bytes) -> tuple[int, int, int]:
+    """Width, height, and bits of a channel, after a walk through the chunks of a PNG file (ISO/IEC 15948, clause 5).
+
+    Raises
+    ------
+    DamagedFileError
+        A checksum is wrong, or the file ends before its last chunk.
+    """
+    position, size = 8, None
+    while position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4], "big")
+        kind = data[position + 4 : position + 8]
+        end = position + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(data[position + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise DamagedFileError(f"the PNG file is corrupt: wrong checksum at byte {position}")
+        if kind == b"IHDR":
+            size = struct.unpack(">IIB", data[position + 8 : position + 17])
+        if kind == b"IEND" and size is not None:
+            return size[0], size[1], size[2]
+        position = end
+    raise DamagedFileError("the PNG file is truncated")

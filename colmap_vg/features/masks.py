@@ -1,0 +1,71 @@
+"""Masks of photographs: which file is whose, and whether it can be used."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+from colmap_vg.errors import ImageFolderError
+from colmap_vg.features.photographs import Photograph, SkippedFile, check_photograph
+
+_MASK_ENDINGS = (".png", ".mask.png", ".jpg", ".jpeg", ".mask.jpg", ".mask.jpeg")
+
+
+def with_masks(
+    photographs: Sequence[Photograph], image_path: str | PathLike[str], mask_path: str | PathLike[str]
+) -> tuple[list[Photograph], list[SkippedFile]]:
+    """Find the masks of photographs, and leave out those whose mask cannot be used.
+
+    The mask of ``folder/a.jpg`` is ``folder/a.jpg.png`` or ``folder/a.png``, as COLMAP has it, or these with
+    ``.mask.png``, ``.jpg`` or ``.mask.jpg`` in place of ``.png``, and has the photograph's size.
+
+    Parameters
+    ----------
+    photographs : sequence of Photograph
+    image_path, mask_path : path
+
+    Returns
+    -------
+    kept : list of Photograph
+        Those without a mask, too; no file that is the mask of another.
+    skipped : list of SkippedFile
+
+    Raises
+    ------
+    ImageFolderError
+        There is no such folder, or none of the photographs has a mask in it.
+    """
+    masks = Path(mask_path)
+    if not masks.is_dir():
+        raise ImageFolderError(f"no such mask folder: {masks}; check --mask_path")
+    kept, skipped = [], []
+    for photograph in photographs:
+        mask = _mask_of(photograph.name, Path(image_path), masks)
+        checked = None if mask is None else check_photograph(mask, str(mask))
+        if isinstance(checked, SkippedFile):
+            skipped.append(SkippedFile(photograph.name, f"of its mask {mask}: {checked.reason}"))
+        elif checked is not None and (checked.width, checked.height) != (photograph.width, photograph.height):
+            sizes = f"{checked.width} x {checked.height} pixels, not {photograph.width} x {photograph.height}"
+            skipped.append(SkippedFile(photograph.name, f"its mask {mask} is {sizes}"))
+        else:
+            kept.append(replace(photograph, mask=mask))
+    used = {photograph.mask.resolve() for photograph in kept if photograph.mask is not None}
+    kept = [photograph for photograph in kept if (Path(image_path) / photograph.name).resolve() not in used]
+    if kept and not skipped and all(photograph.mask is None for photograph in kept):
+        first = kept[0].name
+        raise ImageFolderError(
+            f"no photograph has a mask in {masks}: the mask of {first} is {first}.png or"
+            f" {Path(first).with_suffix('.png')} there; check --mask_path"
+        )
+    return kept, skipped
+
+
+def _mask_of(name: str, images: Path, masks: Path) -> Path | None:
+    """The mask of a photograph; never the photograph itself, where masks lie beside them."""
+    own = images / name
+    named = (
+        (masks / base).with_name((masks / base).name + ending)
+        for ending in _MASK_ENDINGS
+        for base in (name, Path(name).with_suffix("").as_posix())
+    )
+    return next((path for path in named if path.is_file() and not path.samefile(own)), None)

@@ -1,0 +1,106 @@
+"""Colours of points: the mean over the photographs that see each."""
+
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.pixels import decoded, stretched
+from colmap_vg.stages import StageLog
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Array = NDArray[np.float64]
+
+MAX_ASPECT_CHANGE = 0.01
+"""Between a photograph and a smaller copy of it, whose sides are rounded; a file further off is another picture."""
+
+
+def extract_colors(
+    reconstruction: "pycolmap.Reconstruction", image_path: str | PathLike[str] | None, log: StageLog
+) -> None:
+    """Give points the mean colour of their images, smaller copies of them too; a caveat names images without.
+
+    Parameters
+    ----------
+    reconstruction : pycolmap.Reconstruction
+        Its points' colours are set.
+    image_path : path or None
+        Folder of the photographs; None leaves all points black.
+    log : StageLog
+    """
+    if image_path is None:
+        return
+    folder = Path(image_path)
+    ids = np.fromiter(reconstruction.points3D, dtype=np.uint64)
+    ids.sort()
+    total, count = np.zeros((len(ids), 3)), np.zeros(len(ids))
+    missing, unlike = [], []
+    for image_id in reconstruction.reg_image_ids():
+        image = reconstruction.image(image_id)
+        camera = reconstruction.camera(image.camera_id)
+        pixels = _read(folder / image.name)
+        if pixels is None:
+            missing.append(image.name)
+            continue
+        scale = np.array([pixels.shape[1] / camera.width, pixels.shape[0] / camera.height])
+        if abs(scale[0] / scale[1] - 1.0) > MAX_ASPECT_CHANGE:
+            unlike.append(image.name)
+            continue
+        seen = image.get_observation_points2D()
+        rows = np.searchsorted(ids, np.array([point.point3D_id for point in seen], dtype=np.uint64))
+        total[rows] += interpolated(pixels, np.array([point.xy for point in seen]).reshape(-1, 2) * scale)
+        count[rows] += 1.0
+    _warn(missing, f"are not in {folder}, or cannot be read", reconstruction, log)
+    _warn(unlike, f"have other proportions than the files in {folder}", reconstruction, log)
+    colors = np.round(total / np.maximum(count, 1.0)[:, None]).astype(np.uint8)
+    for point_id, color in zip(ids.tolist(), colors, strict=True):
+        reconstruction.point3D(point_id).color = color
+
+
+def interpolated(pixels: NDArray[np.uint8], points: Array) -> Array:
+    """Colours between pixels, by bilinear interpolation.
+
+    Parameters
+    ----------
+    pixels : (h, w, 3) uint8 array
+    points : (n, 2) array
+        Pixels, as COLMAP counts: the first one's centre is at (0.5, 0.5).
+
+    Returns
+    -------
+    (n, 3) array
+        Outside of the picture, those of its border.
+    """
+    height, width = pixels.shape[:2]
+    at = np.clip(points - 0.5, 0.0, np.array([width - 1.0, height - 1.0]))
+    low = np.minimum(at.astype(np.int64), np.maximum(np.array([width, height]) - 2, 0))
+    (x, y), (u, v) = low.T, (at - low).T[:, :, None]
+    right, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
+    top = (1.0 - u) * pixels[y, x] + u * pixels[y, right]
+    return np.asarray((1.0 - v) * top + v * ((1.0 - u) * pixels[below, x] + u * pixels[below, right]))
+
+
+def _read(path: Path) -> NDArray[np.uint8] | None:
+    """Red, green and blue as stored, before any EXIF orientation; None where there is no picture."""
+    try:
+        pixels = decoded(path.read_bytes())
+    except OSError:
+        return None
+    if pixels is None:
+        return None
+    pixels = np.atleast_3d(pixels)
+    pixels = np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, 2::-1]
+    eight_bits = (stretched(pixels) >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels.astype(np.uint8)
+    return np.ascontiguousarray(eight_bits)
+
+
+def _warn(names: list[str], why: str, reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
+    if names:
+        log.warn(
+            f"{len(names)} of {reconstruction.num_reg_images()} registered images {why} (first: {min(names)}); points"
+            " seen only there stay black."
+        )
