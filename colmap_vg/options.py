@@ -103,7 +103,7 @@ class FeatureOptions(_Checked):
     camera_mode: CameraMode = "auto"  # auto: COLMAP's, which shares a camera only where EXIF says so
     matching: Matching = "auto"  # exhaustive, in folders of more than 20 images selected: by their largest features
     image_list_path: str | PathLike[str] | None = None  # file with one image name a line; None: all of the folder
-    mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png, .mask.png or .jpg of image NAME; black hides
+    mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png or NAME.jpg of image NAME; black hides
     max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are shrunk for extraction; -1: COLMAP's
     max_num_features: int = _number(8192, 1)  # per image
     sequential_overlap: int = _number(10, 1)  # images; each is matched with so many followers

@@ -70,7 +70,8 @@ ImageListPath = Annotated[
     Path | None, typer.Option("--image_list_path", help="Text file with one image name a line: only these are used.")
 ]
 MaskPath = Annotated[
-    Path | None, typer.Option("--mask_path", help="Folder of masks: NAME.png (.mask.png, .jpg) of image NAME; black hides.")
+    Path | None,
+    typer.Option("--mask_path", help="Folder of masks: NAME.png (.jpg) of image NAME; black hides."),
 ]
 MaxImageSize = Annotated[int | None, typer.Option("--max_image_size", help="Pixels; -1: COLMAP's default.")]
 MaxNumFeatures = Annotated[int | None, typer.Option("--max_num_features", help="SIFT features per image, at most.")]

@@ -10,6 +10,8 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.features.pair_selection import (
@@ -25,6 +27,8 @@ from colmap_vg.stages import StageLog
 
 MAX_EXHAUSTIVE = 20
 """Images; in larger folders ``auto`` chooses pairs before it matches them. Smaller ones have hardly a pair to save."""
+MAX_DISTANCE = 100.0
+"""Metres between the GPS positions of photographs that spatial matching pairs."""
 _PAIRS_PER_CALL = 2000
 """Pairs per thread and call of pycolmap: progress is told between calls, and each call indexes its images anew."""
 _SELECTING = 0.05
@@ -65,10 +69,13 @@ def _match(database_path: str | PathLike[str], options: FeatureOptions, log: Sta
         match_pairs(database_path, sequential_pairs(names, options.sequential_overlap), options, log)
         return ""
     if options.matching == "spatial":
-        _require_positions(database_path, log)
+        apart = _without_neighbours(database_path, log)
         spatial = pycolmap.SpatialPairingOptions()
-        spatial.num_threads = options.num_threads
+        spatial.num_threads, spatial.max_distance = options.num_threads, MAX_DISTANCE
         pycolmap.match_spatial(database_path, matching, spatial, verification, device)
+        if apart:
+            pairs = promising_pairs(database_path, options.num_threads, log)
+            match_pairs(database_path, [pair for pair in pairs if not apart.isdisjoint(pair)], options, log)
         return ""
     with pycolmap.Database.open(database_path) as database:
         num_images = database.num_images()
@@ -92,21 +99,42 @@ def _matching_options(
     return matching, verification
 
 
-def _require_positions(database_path: str | PathLike[str], log: StageLog) -> None:
+def _without_neighbours(database_path: str | PathLike[str], log: StageLog) -> set[str]:
+    """Names of images that have no other near by GPS positions: named, and to be matched by their features.
+
+    Raises
+    ------
+    ImageFolderError
+        Fewer than three images have a position.
+    """
     with pycolmap.Database.open(database_path) as database:
-        priors = database.read_all_pose_priors()
         names = {image.image_id: image.name for image in database.read_all_images()}
-    located = {prior.corr_data_id.id for prior in priors if np.all(np.isfinite(prior.position))}
-    lacking = [name for image_id, name in names.items() if image_id not in located]
-    if len(names) - len(lacking) < MIN_IMAGES:
+        priors = {prior.corr_data_id.id: prior for prior in database.read_all_pose_priors()}
+    located = {image_id: prior for image_id, prior in priors.items() if image_id in names and _is_told(prior.position)}
+    if len(located) < MIN_IMAGES:
         raise ImageFolderError(
-            f"{len(names) - len(lacking)} of {len(names)} photographs have a GPS position; spatial matching needs them:"
+            f"{len(located)} of {len(names)} photographs have a GPS position; spatial matching needs them:"
             " use --matching auto"
         )
-    if lacking:
-        log.warn(
-            f"{len(lacking)} photographs have no GPS position, and are matched with no other: {', '.join(lacking)}"
-        )
+    positions = np.array([prior.position for prior in located.values()])
+    if all(prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84 for prior in located.values()):
+        positions[:, 2] = 0.0
+        positions = pycolmap.GPSTransform().ellipsoid_to_ecef(positions)
+    nearest = cKDTree(positions).query(positions, 2)[0][:, 1]
+    far = [names[image_id] for image_id, away in zip(located, nearest, strict=True) if away > MAX_DISTANCE]
+    lacking = [name for image_id, name in names.items() if image_id not in located]
+    for apart, why in (
+        (lacking, "have no GPS position"),
+        (far, f"are more than {MAX_DISTANCE:.0f} m away from all others"),
+    ):
+        if apart:
+            log.warn(f"{len(apart)} photographs {why}, and are matched by their features: {', '.join(sorted(apart))}")
+    return {*far, *lacking}
+
+
+def _is_told(position: NDArray[np.float64]) -> bool:
+    """Whether a GPS position is one: receivers without a fix write zeros, in the Gulf of Guinea."""
+    return bool(np.all(np.isfinite(position)) and np.any(position[:2] != 0.0))
 
 
 def promising_pairs(database_path: str | PathLike[str], num_threads: int, log: StageLog) -> list[tuple[str, str]]:

@@ -150,17 +150,24 @@ def test_photographs_without_features_are_no_obstacle(tmp_path: Path, images: Pa
     assert any("blank.png" in pair for pair in pairs)
 
 
-def test_spatial_matching_pairs_those_that_were_near(tmp_path: Path, corner: Corner) -> None:
+def test_spatial_matching_pairs_those_that_were_near_and_the_others_by_features(tmp_path: Path) -> None:
+    """Two at 30 m, one a kilometre away, one without a position, one of a receiver without a fix."""
     (tmp_path / "images").mkdir()
-    for index, image in enumerate(corner.images):
+    north, east = (55.0, 55.00027, 55.0, 55.0, 55.01, None, 0.0), (13.0, 13.0, 13.005, 13.0051, 13.0, None, 0.0)
+    for index, image in enumerate(render_corner(7).images):
         path = tmp_path / "images" / f"{index}.jpg"
         write_jpeg(path, image)
-        if index < 3:  # 30 m apart, then a kilometre
-            path.write_bytes(with_position(path.read_bytes(), 55.0 + (0.0, 0.00027, 0.01)[index], 13.0))
+        if north[index] is not None:
+            path.write_bytes(with_position(path.read_bytes(), north[index], east[index]))
     log = StageLog()
     extract_and_match(tmp_path / "images", tmp_path / "a.db", replace(QUICK, matching="spatial"), log)
-    assert set(matched(tmp_path / "a.db")) == {("0.jpg", "1.jpg")}
-    assert ["3.jpg" in warning for warning in log.warnings] == [True]
+    pairs = set(matched(tmp_path / "a.db"))
+    placed = {"0.jpg", "1.jpg", "2.jpg", "3.jpg"}
+    assert {pair for pair in pairs if placed.issuperset(pair)} == {("0.jpg", "1.jpg"), ("2.jpg", "3.jpg")}
+    for name in ("4.jpg", "5.jpg", "6.jpg"):
+        assert sum(name in pair for pair in pairs) >= 2
+    told = [warning for warning in log.warnings if "matched by their features" in warning]
+    assert [("5.jpg, 6.jpg" in warning, "4.jpg" in warning) for warning in told] == [(True, False), (False, True)]
 
 
 def test_spatial_matching_needs_three_positions(tmp_path: Path, corner: Corner) -> None:
