@@ -107,9 +107,10 @@ def make_database(
     if finished.exists() and not record_path.exists() and not overwrite:
         raise OutputError(
             f"{finished} is there already, and colmap-vg did not make it here: map it with "
-            f"`colmap-vg mapper`, choose another --output_path, or replace it with --overwrite"
+            f"view_graph_mapping, choose another output_path, or replace it with overwrite=True"
         )
-    inside = (Path(output_path),) if Path(output_path).resolve() != Path(image_path).resolve() else ()
+    output = Path(output_path).resolve()
+    inside = [output] if Path(image_path).resolve() in output.parents else []
     photographs, skipped = check_photographs(image_path, options, log, inside)
     names = [photograph.name for photograph in photographs]
     with work_folder(output_path, overwrite) as work:
@@ -131,7 +132,7 @@ def make_database(
         try:
             unfinished.replace(finished)
         except OSError as error:
-            raise OutputError(f"cannot write {finished}: {error.strerror}; choose another --output_path") from error
+            raise OutputError(f"cannot write {finished}: {error.strerror}; choose another output_path") from error
         return FeatureResult(tuple(names), (*skipped, *unreadable), num_verified_pairs)
 
 
@@ -146,7 +147,7 @@ def _start_afresh(finished: Path, unfinished: Path, record_path: Path, record: d
         written.replace(record_path)
     except OSError as error:
         raise OutputError(
-            f"cannot write to {record_path.parent}: {error.strerror}; choose another --output_path"
+            f"cannot write to {record_path.parent}: {error.strerror}; choose another output_path"
         ) from error
 
 
@@ -195,6 +196,6 @@ def _query(database_path: Path, statement: str) -> list[tuple[str | int, ...]]:
     try:
         return connection.execute(statement).fetchall()
     except sqlite3.DatabaseError as error:
-        raise OutputError(f"{database_path} is damaged ({error}): run again without --resume") from error
+        raise OutputError(f"{database_path} is damaged ({error}): run again without resume=True") from error
     finally:
         connection.close()

@@ -133,7 +133,7 @@ def _locked_file(path: Path, output_path: str | PathLike[str]) -> int:
             if time.monotonic() >= deadline:
                 raise OutputError(
                     f"another job (process {other or 'unknown'}) is at work in {output_path}: wait until it has ended,"
-                    " or choose another --output_path"
+                    " or choose another output_path"
                 ) from error
             time.sleep(0.05)
             continue
@@ -154,7 +154,7 @@ def _inode(path: Path) -> int | None:
 
 
 def _not_writable(output_path: str | PathLike[str], why: str | None) -> OutputError:
-    return OutputError(f"cannot write to the output folder {output_path}: {why}; choose another --output_path")
+    return OutputError(f"cannot write to the output folder {output_path}: {why}; choose another output_path")
 
 
 def refuse_models(output_path: str | PathLike[str], overwrite: bool = False) -> None:
@@ -162,11 +162,11 @@ def refuse_models(output_path: str | PathLike[str], overwrite: bool = False) -> 
     models = existing_models(output_path)
     first = Path(output_path) / "0"
     if first.exists() and first not in models and not (first.is_dir() and not any(first.iterdir())):
-        raise OutputError(f"{first} is there and is no model: move it, or choose another --output_path")
+        raise OutputError(f"{first} is there and is no model: move it, or choose another output_path")
     if models and not overwrite:
         raise OutputError(
-            f"{output_path} already holds a model ({models[0]}): choose another --output_path, or replace it with "
-            "--overwrite"
+            f"{output_path} already holds a model ({models[0]}): choose another output_path, or replace it with "
+            "overwrite=True"
         )
 
 

@@ -209,7 +209,7 @@ def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
             rows = list(csv.DictReader(file))
     except OSError as error:
         raise DataFileError(
-            f"{path}: {error.strerror}; --output_path takes the folder of a finished run or mapper job"
+            f"{path}: {error.strerror}; output_path takes the folder of a finished run or mapper job"
         ) from error
     for number, row in enumerate(rows, start=2):
         if any(row.get(column) is None for column in columns):

@@ -68,7 +68,7 @@ def test_other_options_or_photographs_start_afresh(tmp_path: Path, images: Path)
 
 def test_a_database_of_the_users_own_is_not_replaced(tmp_path: Path, images: Path) -> None:
     (tmp_path / "database.db").write_text("precious")
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="overwrite=True"):
         make_database(images, tmp_path, OPTIONS)
     assert (tmp_path / "database.db").read_text() == "precious"
     assert make_database(images, tmp_path, OPTIONS, overwrite=True).num_verified_pairs > 0

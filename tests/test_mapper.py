@@ -295,7 +295,7 @@ def test_an_older_model_is_replaced_whole_and_only_when_asked(
         (tmp_path / str(index)).mkdir()
         for name in ("cameras.txt", "notes.txt"):
             (tmp_path / str(index) / name).write_text("old")
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="overwrite=True"):
         view_graph_mapping(noisy[0], None, tmp_path, ONE_THREAD)
     assert (tmp_path / "1" / "cameras.txt").read_text() == "old"
     view_graph_mapping(noisy[0], None, tmp_path, MappingOptions(num_threads=1, overwrite=True))

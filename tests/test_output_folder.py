@@ -23,14 +23,14 @@ def test_a_new_folder_and_an_empty_one_are_fine(tmp_path: Path) -> None:
 def test_a_path_under_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(OutputError, match="choose another --output_path"):
+        with pytest.raises(OutputError, match="choose another output_path"):
             prepare_output(path)
 
 
 @pytest.mark.parametrize("place", ["0", "3", "."])
 def test_a_model_is_not_overwritten_unasked(tmp_path: Path, place: str) -> None:
     model(tmp_path / "out" / place, "old")
-    with pytest.raises(OutputError, match="--overwrite"):
+    with pytest.raises(OutputError, match="overwrite=True"):
         prepare_output(tmp_path / "out")
     assert not (tmp_path / "out" / ".work").exists()
     prepare_output(tmp_path / "out", overwrite=True)

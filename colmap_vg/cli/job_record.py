@@ -68,7 +68,9 @@ def recorded_job(
     """
     with output_lock(output_path):
         path = output_path / WORK_NAME / RECORD_NAME
-        job = json.loads(json.dumps({"verb": verb, "options": _inputs(plain(asked)), "source": _fingerprint(source)}))
+        job = json.loads(
+            json.dumps({"verb": verb, "options": _inputs(plain(asked)), "source": _fingerprint(source, output_path)})
+        )
         before = _read(path) if resume else {}
         models = existing_models(output_path)
         if models and before == {**job, "finished": True} and (output_path / SUMMARY_NAME).exists():
@@ -93,17 +95,34 @@ def _inputs(asked: object) -> object:
     return asked
 
 
-def _fingerprint(source: Path | None) -> str:
-    """Names, sizes and times of a file, or of the files in a folder."""
+def _fingerprint(source: Path | None, output_path: Path) -> str:
+    """Names, sizes and times of a file, or of the files in a folder but for those that jobs write there."""
     if source is None:
         return ""
-    files = sorted(source.rglob("*")) if source.is_dir() else [source]
+    if source.is_dir():
+        files = [path for path in sorted(source.rglob("*")) if not _is_written(path, source, output_path)]
+    else:
+        files = [source]
     digest = hashlib.sha256()
     for file in files:
         with suppress(OSError):  # the job itself will tell
             status = file.stat()
             digest.update(f"{file}\0{status.st_size}\0{status.st_mtime_ns}\0".encode(errors="surrogateescape"))
     return digest.hexdigest()
+
+
+def _is_written(file: Path, source: Path, output_path: Path) -> bool:
+    """Whether a job writes the file, or may have: its output lies in the folder of its photographs, or is that folder.
+
+    The photographs of a demo lie in its output folder, the other way round.
+    """
+    output = output_path.resolve()
+    if file.is_dir():
+        return True  # by its files
+    if source.resolve() in output.parents:
+        return output in file.resolve().parents
+    first = file.relative_to(source).parts[0] if source.resolve() == output else ""
+    return first == WORK_NAME or first.isdecimal() or first.endswith((".db", ".db-wal", ".db-shm", ".json", ".csv"))
 
 
 def _read(path: Path) -> dict[str, object]:
@@ -122,6 +141,4 @@ def _write(path: Path, content: Mapping[str, object]) -> None:
     except OSError as error:
         with suppress(OSError):
             written.unlink()
-        raise OutputError(
-            f"cannot write {path}: {error.strerror}; make room or choose another --output_path"
-        ) from error
+        raise OutputError(f"cannot write {path}: {error.strerror}; make room or choose another output_path") from error

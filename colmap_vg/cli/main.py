@@ -11,6 +11,7 @@ import typer
 from colmap_vg._version import __version__
 from colmap_vg.cli import colmap_flags
 from colmap_vg.cli.reporter import Reporter
+from colmap_vg.cli.wording import with_flags
 from colmap_vg.errors import ColmapVgError, OptionError
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
 from colmap_vg.options import Matching as MatchingOption
@@ -390,7 +391,7 @@ def _job(quiet: bool, verbose: bool) -> Iterator[Reporter]:
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+    return with_flags(" ".join(str(error).split()))
 
 
 def _boolean(flag: str, value: str) -> bool:

@@ -168,13 +168,13 @@ def write_model(reconstruction: "pycolmap.Reconstruction", folder: Path) -> None
         reconstruction.write(folder)
         found = {path.name: path.stat().st_size for path in folder.iterdir()}
     except (OSError, RuntimeError, ValueError) as error:
-        raise OutputError(f"cannot write a model to {folder} ({error}); choose another --output_path") from error
+        raise OutputError(f"cannot write a model to {folder} ({error}); choose another output_path") from error
     expected = _file_sizes(reconstruction)
     short = [name for name, size in expected.items() if found.get(name, 0) < size]
     if short:
         raise OutputError(
             f"{folder / short[0]} has {found.get(short[0], 0)} of {expected[short[0]]} bytes: the disk is full, or a"
-            " limit on the size of files was reached; make room or choose another --output_path"
+            " limit on the size of files was reached; make room or choose another output_path"
         )
 
 

@@ -171,7 +171,7 @@ def read_image_list(path: str | PathLike[str]) -> list[str]:
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ImageFolderError(f"cannot read the image list {path}: {error}; check --image_list_path") from error
+        raise ImageFolderError(f"cannot read the image list {path}: {error}; check image_list_path") from error
     names = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not names:
         raise ImageFolderError(f"the image list {path} names no image")

@@ -141,17 +141,19 @@ def _ended(code: int, said: str, database_path: Path) -> ColmapVgError:
     if fault is not None or full:
         reason = next((word for word in _WRITE_FAULTS if fault is not None and word in fault), "the disk is full")
         return OutputError(
-            f"{database_path} cannot be written ({reason}): make room or choose another --output_path, and go on with"
-            " --resume"
+            f"{database_path} cannot be written ({reason}): make room or choose another output_path, and go on with"
+            " resume=True"
         )
     if -code == signal.SIGKILL:
         return ImageFolderError(
             f"the process that worked on {database_path} was killed, most likely because memory ran out: lower"
-            " --num_threads or --max_image_size"
+            " num_threads or max_image_size"
         )
     reason = f"signal {signal.Signals(-code).name}" if code < 0 else f"code {code}"
     what = next((line for line in lines if "what()" in line or "Error" in line), lines[-1] if lines else "no message")
-    return ImageFolderError(f"COLMAP ended with {reason} while it worked on {database_path} ({what}); see --verbose")
+    return ImageFolderError(
+        f"COLMAP ended with {reason} while it worked on {database_path} ({what}); its log tells more"
+    )
 
 
 def serve() -> None:

@@ -37,7 +37,7 @@ def with_masks(
     """
     masks = Path(mask_path)
     if not masks.is_dir():
-        raise ImageFolderError(f"no such mask folder: {masks}; check --mask_path")
+        raise ImageFolderError(f"no such mask folder: {masks}; check mask_path")
     kept, skipped = [], []
     for photograph in photographs:
         mask = _mask_of(photograph.name, Path(image_path), masks)
@@ -55,7 +55,7 @@ def with_masks(
         first = kept[0].name
         raise ImageFolderError(
             f"no photograph has a mask in {masks}: the mask of {first} is {first}.png or"
-            f" {Path(first).with_suffix('.png')} there; check --mask_path"
+            f" {Path(first).with_suffix('.png')} there; check mask_path"
         )
     return kept, skipped
 

@@ -114,7 +114,7 @@ def _without_neighbours(database_path: str | PathLike[str], log: StageLog) -> se
     if len(located) < MIN_IMAGES:
         raise ImageFolderError(
             f"{len(located)} of {len(names)} photographs have a GPS position; spatial matching needs them:"
-            " use --matching auto"
+            " use matching='auto'"
         )
     positions = np.array([prior.position for prior in located.values()])
     if all(prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84 for prior in located.values()):

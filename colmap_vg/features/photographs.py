@@ -94,9 +94,9 @@ def find_photographs(
     """
     folder = Path(image_path)
     if not folder.exists():
-        raise ImageFolderError(f"no such image folder: {folder}; check --image_path")
+        raise ImageFolderError(f"no such image folder: {folder}; check image_path")
     if not folder.is_dir():
-        raise ImageFolderError(f"{folder} is a file; --image_path must be the folder that holds the photographs")
+        raise ImageFolderError(f"{folder} is a file; image_path must be the folder that holds the photographs")
     photographs: list[Photograph] = []
     skipped: list[SkippedFile] = []
     for name in sorted(set(names)) if names is not None else _visible_files(folder, exclude):

@@ -185,3 +185,18 @@ def test_a_demo_goes_on_with_its_photographs(tmp_path: Path) -> None:
     assert process.returncode == 0
     assert "render: started\n" not in said
     assert {path.name: sha256(path) for path in (tmp_path / "images").iterdir()} == photographs
+
+
+@pytest.mark.parametrize("inside", ["model", "."])
+def test_a_finished_job_in_its_image_folder_is_finished(tmp_path: Path, inside: str) -> None:
+    """What a job writes beside its photographs does not make it another job, nor does it become a photograph."""
+    render_corner(4).write(tmp_path)
+    arguments = ["run", "--image_path", tmp_path, "--output_path", tmp_path / inside, *SMALL]
+    first = finish(*arguments)
+    assert first.returncode == 0, first.stderr
+    assert "skipped" not in first.stdout + first.stderr
+    again = finish(*arguments, "--resume")
+    assert again.returncode == 0, again.stderr
+    assert "nothing is left to do" in again.stdout
+    (tmp_path / "00.jpg").unlink()
+    assert "already holds a model" in finish(*arguments, "--resume").stderr

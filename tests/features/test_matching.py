@@ -174,7 +174,7 @@ def test_spatial_matching_needs_three_positions(tmp_path: Path, corner: Corner) 
     corner.write(tmp_path / "images")
     path = tmp_path / "images" / "00.jpg"
     path.write_bytes(with_position(path.read_bytes(), 55.0, 13.0))
-    with pytest.raises(ImageFolderError, match=r"1 of 4 photographs .* GPS position.*--matching auto"):
+    with pytest.raises(ImageFolderError, match=r"1 of 4 photographs .* GPS position.*matching='auto'"):
         extract_and_match(tmp_path / "images", tmp_path / "a.db", replace(QUICK, matching="spatial"))
 
 
