@@ -315,7 +315,9 @@ def _on_own_cameras(
         log.result(f"the photographs show different lenses: calibrated one by one, the cost falls by {1.0 - left:.0%}")
         return trial
     log.result(f"one lens: calibrated one by one, the cost would fall by {1.0 - left:.1%} only")
-    return with_own_cameras(cache, shared, replaced)
+    model = with_own_cameras(cache, shared, replaced)
+    model.tear_down()  # of the cameras, rigs and images of other models
+    return model
 
 
 def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Model]) -> PoseSolution:

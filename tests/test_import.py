@@ -8,7 +8,10 @@ from pathlib import Path
 
 import colmap_vg
 
-ABOVE_THE_NUMERICS = ("cli", "report", "viewer", "demo", "image_folder", "mapper", "mapping", "colmap_io", "features")
+ABOVE_THE_NUMERICS = (
+    *("cli", "report", "viewer", "demo", "image_folder", "mapper"),
+    *("mapping", "colmap_io", "features", "pixels"),
+)
 
 
 def run_python(code: str) -> str:

@@ -121,6 +121,7 @@ REFUSED = {
     "--GlobalMapper.image_list_path": "all images of the database are mapped",
     "--Mapper.fix_existing_images": "all cameras are adjusted",
     "--Mapper.fix_existing_frames": "all cameras are adjusted",
+    "--Mapper.max_extra_param": "no image is left out for the parameters of its camera",
     "--Mapper.constant_rig_list_path": "all cameras are adjusted",
     "--Mapper.constant_camera_list_path": "all intrinsics are adjusted, or none (--ba_refine_focal_length and others)",
 }

@@ -7,7 +7,6 @@ matrices. The lens is COLMAP's polynomial with the radius over half of the image
 r_u^2)``, which needs no focal length.
 """
 
-import sqlite3
 from dataclasses import replace
 from os import PathLike
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import has_radial_term, with_radial_term
 from colmap_vg.colmap_io.database import reading
+from colmap_vg.colmap_io.raw_matches import raw_matches, with_raw_matches
 from colmap_vg.colmap_io.tables import MAX_NUM_IMAGES, DatabaseTables
 
 Array = NDArray[np.float64]
@@ -72,7 +72,8 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
         return tables, terms
     cameras = tuple(with_radial_term(c, t) if t else c for c, t in zip(tables.cameras, terms.tolist(), strict=True))
     bent = replace(tables, cameras=cameras, caveats=(*tables.caveats, *caveats))
-    return _with_raw_matches(bent, database_path, terms != 0.0), terms
+    of_bent = np.asarray((terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1))
+    return with_raw_matches(bent, database_path, of_bent), terms
 
 
 def _found_term(tables: DatabaseTables, database_path: str | PathLike[str], images: BoolArray) -> tuple[float, float]:
@@ -110,7 +111,7 @@ def _matches_to_ask(
             pair = row_of.get(pair_id // MAX_NUM_IMAGES, -1), row_of.get(pair_id % MAX_NUM_IMAGES, -1)
             if min(pair) < 0 or not images[list(pair)].all() or count[list(pair)].max() >= PAIRS_PER_IMAGE:
                 continue
-            matches = _raw_matches(connection, tables, pair_id, pair)
+            matches = raw_matches(connection, tables, pair)
             if matches is None:
                 continue
             count[list(pair)] += 1
@@ -119,37 +120,6 @@ def _matches_to_ask(
             if len(pairs) == MAX_PAIRS:
                 break
     return pairs, found
-
-
-def _raw_matches(
-    connection: sqlite3.Connection, tables: DatabaseTables, pair_id: int, pair: tuple[int, int]
-) -> IntArray | None:
-    """A pair's matches before verification (k, 2); None where the row is missing or damaged."""
-    found = connection.execute(
-        "SELECT rows, cols, data FROM matches WHERE pair_id = ? AND typeof(data) = 'blob'", (pair_id,)
-    ).fetchone()
-    if found is None or found[1] != 2 or found[0] * 8 != len(found[2]):
-        return None
-    matches = np.frombuffer(found[2], dtype=np.uint32).reshape(-1, 2).astype(np.int64)
-    size = [len(tables.keypoints[image]) for image in pair]
-    return matches if len(matches) and (matches < size).all() else None
-
-
-def _with_raw_matches(tables: DatabaseTables, database_path: str | PathLike[str], bent: BoolArray) -> DatabaseTables:
-    """The tables without the matrices of pairs of bent cameras, and with their matches before verification."""
-    of_bent = np.asarray(bent[tables.camera_idx[tables.pairs]].any(axis=1))
-    kept = [tables.matches[a:b] for a, b in zip(tables.offsets[:-1], tables.offsets[1:], strict=True)]
-    with reading(database_path) as connection:
-        for row in np.flatnonzero(of_bent).tolist():
-            i, j = tables.pairs[row].tolist()
-            pair_id = int(tables.image_ids[i]) * MAX_NUM_IMAGES + int(tables.image_ids[j])
-            raw = _raw_matches(connection, tables, pair_id, (i, j))
-            kept[row] = kept[row] if raw is None else raw
-    matrices = {name: getattr(tables, name).copy() for name in ("E", "F", "H", "rotations", "translations")}
-    for matrix in matrices.values():
-        matrix[of_bent] = np.nan
-    offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
-    return replace(tables, matches=np.concatenate(kept), offsets=offsets, **matrices)
 
 
 def _centered(tables: DatabaseTables, image: int, rows: IntArray) -> tuple[Array, float]:

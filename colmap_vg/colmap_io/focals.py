@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.tables import DatabaseTables
+from colmap_vg.colmap_io.tables import CALIBRATED, PANORAMIC, PLANAR, PLANAR_OR_PANORAMIC, UNCALIBRATED, DatabaseTables
 from colmap_vg.colmap_io.undistortion import undistorted_keypoints
 from colmap_vg.epipolar.self_calibration import SelfCalibration, estimate_focal_lengths
 from colmap_vg.options import ReadOptions
@@ -20,8 +20,6 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-CALIBRATED, UNCALIBRATED = 2, 3
-"""COLMAP's two-view configurations of general scenes."""
 ALIKE = 0.03
 """Relative difference below which two votes are taken for one lens; lenses differ by more, or it does not matter."""
 MAX_PAIRS_PER_CAMERA = 400
@@ -83,8 +81,7 @@ def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> Fo
     given = prior & (options.trust_focal_lengths != "never")
     calibration = _self_calibration(tables, focals, given, options)
     if calibration is None:
-        caveat = "No pair has enough matches to check the focal lengths; they are taken as they are in the database."
-        return FocalDecision(np.ones(len(focals)), prior, (caveat,))
+        return FocalDecision(np.ones(len(focals)), prior, (_why_unchecked(tables, options),))
     found = calibration.focal_lengths
     without = ~given & ~calibration.decided
     found = np.where(given, found, _in_common(tables, found, calibration, given))
@@ -102,6 +99,19 @@ def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> Fo
             f" {source}."
         )
     return FocalDecision(np.asarray(scales, dtype=float), given & ~calibration.found, tuple(caveats))
+
+
+def _why_unchecked(tables: DatabaseTables, options: ReadOptions) -> str:
+    """The caveat of a database in which no pair can vote."""
+    enough = np.diff(tables.offsets) >= max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)
+    flat = np.isin(tables.configs, (PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC))
+    if (enough & flat).any():
+        why = f"in {int((enough & flat).sum())} pairs all matches are on one plane, or the camera turned on the spot"
+    elif enough.any():
+        why = "COLMAP found no geometry for the pairs that have enough matches"
+    else:
+        why = f"no pair has the {max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)} matches that it takes"
+    return f"The focal lengths cannot be checked, and are taken as they are in the database: {why}."
 
 
 def _in_common(tables: DatabaseTables, found: Array, calibration: SelfCalibration, given: BoolArray) -> Array:

@@ -11,6 +11,7 @@ from colmap_vg.colmap_io.distortion import with_found_distortion
 from colmap_vg.colmap_io.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.relative_poses import relative_poses
+from colmap_vg.colmap_io.still_background import without_still_background
 from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
 from colmap_vg.colmap_io.verification import with_own_geometries
 from colmap_vg.linear.threads import single_threaded_blas
@@ -56,7 +57,10 @@ def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) 
     terms = np.zeros(len(tables.cameras))
     if options.find_distortion:
         tables, terms = with_found_distortion(tables, database_path)
-    tables, changed = with_own_geometries(tables, options.random_seed, terms != 0.0)
+    tables, thinned = without_still_background(tables, database_path)
+    expected = thinned | (terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1)
+    tables, changed = with_own_geometries(tables, options.random_seed, expected)
+    changed |= thinned
     focals = decide_focal_lengths(tables, options)
     return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
 

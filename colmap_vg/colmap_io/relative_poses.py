@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import calibration_matrix
-from colmap_vg.colmap_io.tables import DatabaseTables
+from colmap_vg.colmap_io.tables import (
+    DEGENERATE,
+    PANORAMIC,
+    PLANAR,
+    PLANAR_OR_PANORAMIC,
+    UNCALIBRATED,
+    WATERMARK,
+    DatabaseTables,
+)
 from colmap_vg.epipolar.edge_information import refine_relative_poses
 from colmap_vg.epipolar.sampson import Matches, residuals
 from colmap_vg.geometry.directions import normalized
@@ -37,8 +45,6 @@ from colmap_vg.verdicts import EdgeVerdict
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-DEGENERATE, CALIBRATED, UNCALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC, WATERMARK = 1, 2, 3, 4, 5, 6, 7
 
 MIN_SHARE_IN_FRONT = 0.5
 """Below this share of matches in front of both cameras a pose is a guess."""

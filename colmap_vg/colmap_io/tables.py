@@ -17,6 +17,8 @@ from colmap_vg.errors import DatabaseError
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+UNDEFINED, DEGENERATE, CALIBRATED, UNCALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC, WATERMARK = range(8)
+"""COLMAP's configurations of pairs, as a database has them."""
 MAX_SIZE_PX, MAX_COORDINATE_PX = 2**24, 1e7
 """Pixels; larger images and coordinates are damage, and their products would leave the numbers' range."""
 MIN_FOCAL_SHARE, MAX_FOCAL_SHARE = 1e-3, 1e6

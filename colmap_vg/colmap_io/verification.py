@@ -13,8 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import calibration_matrix
-from colmap_vg.colmap_io.relative_poses import CALIBRATED, DEGENERATE, UNCALIBRATED, WATERMARK
-from colmap_vg.colmap_io.tables import DatabaseTables
+from colmap_vg.colmap_io.tables import CALIBRATED, DEGENERATE, UNCALIBRATED, UNDEFINED, WATERMARK, DatabaseTables
 from colmap_vg.colmap_io.undistortion import undistorted_keypoints
 from colmap_vg.geometry import so3
 from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
@@ -39,8 +38,6 @@ MATCHES_LOOKED_AT = 100
 MIN_NUM_MATCHES, MIN_NUM_REFITTED = 15, 8
 FAR = 1e12
 """Pixels; where a matrix is missing or tells nothing of a match."""
-UNDEFINED = 0
-"""COLMAP's configuration of pairs that nobody verified."""
 
 
 def with_own_geometries(
@@ -53,8 +50,8 @@ def with_own_geometries(
     tables : DatabaseTables
     seed : int
         Of the verification.
-    expected : (c,) bool array, optional
-        Cameras whose pairs are known to need it, and need no caveat.
+    expected : (m,) bool array, optional
+        Pairs that are known to need it, and need no caveat.
 
     Returns
     -------
@@ -102,7 +99,7 @@ def with_own_geometries(
         found = _verified(found, doubtful, seed)
         after = int(np.diff(found.offsets)[doubtful].sum())
         caveat += f" In {len(doubtful)} of them matches look unverified: {before - after} of {before} were wrong."
-    if expected is not None and expected[tables.camera_idx[tables.pairs[unbelieved]]].any(axis=1).all():
+    if expected is not None and expected[unbelieved].all():
         return found, changed
     return replace(found, caveats=(*tables.caveats, caveat)), changed
 

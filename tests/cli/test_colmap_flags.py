@@ -38,7 +38,7 @@ def test_no_flag_is_both_obeyed_and_ignored() -> None:
 def test_flags_that_restrict_a_job_are_refused_unless_they_are_off(flag: str) -> None:
     assert flag in IGNORED
     for arguments in ([flag, "some.txt"], [f"{flag}=1"], [flag]):
-        with pytest.raises(UnknownArgumentError, match=f"{flag} is not supported: all|{flag} is not supported: a job"):
+        with pytest.raises(UnknownArgumentError, match=f"{flag} is not supported: (all|no|a) "):
             ignored_flags(arguments)
     assert ignored_flags([flag, "0"]) == [flag]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from synthetic_databases import centers, changed_copy, make_database, sha256
+from synthetic_databases import centers, changed_copy, make_database, pair_id, sha256
 
 from colmap_vg import MappingOptions, align_positions, read_view_graph, view_graph_mapping
 from colmap_vg.colmap_io.shared_cameras import merge_cameras, shared_cameras
@@ -50,6 +50,23 @@ def test_cameras_share_a_lens_and_the_model_has_them_all(tmp_path: Path) -> None
     assert written.num_points3D() == models[True].num_points3D()
     written.update_point_3d_errors()
     assert written.compute_mean_reprojection_error() < 1.0
+
+
+def test_each_of_two_models_has_its_own_cameras_only(tmp_path: Path) -> None:
+    truth = make_database(tmp_path / "true.db", noise_px=0.5, camera=RADIAL, camera_per_image=True, num_points=400)
+    ids = sorted(truth.images)
+    halves = set(ids[:5]), set(ids[5:])
+    apart = [("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id(i, j),)) for i in ids[:5] for j in ids[5:]]
+    path = changed_copy(tmp_path / "true.db", tmp_path / "apart.db", *apart)
+    models = view_graph_mapping(path, None, tmp_path / "out")
+    assert len(models) == 2
+    for index, model in models.items():
+        written = pycolmap.Reconstruction(tmp_path / "out" / str(index))
+        assert set(model.reg_image_ids()) in halves
+        for kept in (model, written):
+            assert set(kept.images) == set(model.reg_image_ids())
+            assert set(kept.cameras) == {truth.image(i).camera_id for i in model.reg_image_ids()}
+            assert len(kept.rigs) == len(kept.frames) == 5
 
 
 def test_lenses_that_differ_are_found_out(tmp_path: Path) -> None:

@@ -1,0 +1,43 @@
+"""Matches of a database as they were before verification."""
+
+import sqlite3
+from dataclasses import replace
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.database import reading
+from colmap_vg.colmap_io.tables import MAX_NUM_IMAGES, DatabaseTables
+
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+def raw_matches(connection: sqlite3.Connection, tables: DatabaseTables, pair: tuple[int, int]) -> IntArray | None:
+    """Matches (k, 2) of two rows of images before verification; None where they are missing or damaged."""
+    image_id1, image_id2 = (int(tables.image_ids[image]) for image in pair)
+    found = connection.execute(
+        "SELECT rows, cols, data FROM matches WHERE pair_id = ? AND typeof(data) = 'blob'",
+        (image_id1 * MAX_NUM_IMAGES + image_id2,),
+    ).fetchone()
+    if found is None or found[1] != 2 or found[0] * 8 != len(found[2]):
+        return None
+    matches = np.frombuffer(found[2], dtype=np.uint32).reshape(-1, 2).astype(np.int64)
+    size = [len(tables.keypoints[image]) for image in pair]
+    return matches if len(matches) and (matches < size).all() else None
+
+
+def with_raw_matches(tables: DatabaseTables, database_path: str | PathLike[str], marked: BoolArray) -> DatabaseTables:
+    """The tables without the matrices of marked pairs (m,), and with their matches before verification."""
+    kept = [tables.matches[a:b] for a, b in zip(tables.offsets[:-1], tables.offsets[1:], strict=True)]
+    with reading(database_path) as connection:
+        for row in np.flatnonzero(marked).tolist():
+            i, j = tables.pairs[row].tolist()
+            raw = raw_matches(connection, tables, (i, j))
+            kept[row] = kept[row] if raw is None else raw
+    matrices = {name: getattr(tables, name).copy() for name in ("E", "F", "H", "rotations", "translations")}
+    for matrix in matrices.values():
+        matrix[marked] = np.nan
+    offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
+    return replace(tables, matches=np.concatenate(kept), offsets=offsets, **matrices)
