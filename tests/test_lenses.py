@@ -155,12 +155,52 @@ def test_undistorted_points_distort_back(kappa: float) -> None:
         assert np.isnan(undistorted(np.array([[0.0, 5.0]]), kappa)).all()
 
 
-@pytest.mark.parametrize(("model", "odd"), [("FULL_OPENCV", True), ("OPENCV", False)])
-def test_coefficients_beyond_reason_are_a_warning(model: str, odd: bool, tmp_path: Path) -> None:
-    """Narrow views tell no high-order terms: bundle adjustment plays them against each other."""
-    params = (2600.0, 2600.0, 512.0, 384.0, -0.05, 0.01, 0.0, 0.0) + (0.0,) * (4 if odd else 0)
-    make_database(tmp_path / "a.db", num_images=8, num_points=60, noise_px=0.5, camera=(model, params))
+@pytest.mark.parametrize(("given", "told"), [(True, "kept as they came"), (False, "they are 0")])
+@pytest.mark.parametrize("model", ["FULL_OPENCV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"])
+def test_coefficients_that_run_away_are_taken_back(model: str, given: bool, told: str, tmp_path: Path) -> None:
+    """Narrow views tell no terms of high order: bundle adjustment plays them against each other."""
+    size = {"FULL_OPENCV": 8, "THIN_PRISM_FISHEYE": 8, "RAD_TAN_THIN_PRISM_FISHEYE": 12}[model]
+    params = (2600.0, 2600.0, 512.0, 384.0) + (0.001,) * size
+    truth = make_database(tmp_path / "a.db", num_images=8, num_points=60, noise_px=0.5, camera=(model, params))
+    if not given:
+        with pycolmap.Database.open(tmp_path / "a.db") as database:
+            lens = database.read_all_cameras()[0]
+            lens.params = [*params[:4], *[0.0] * size]
+            database.update_camera(lens)
     log = StageLog()
-    lens = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log).models[0].camera(1)
-    assert (np.abs(lens.params[4:]).max() > 10.0) == odd
-    assert any("hold" in warning and "do not tell" in warning for warning in log.warnings) == odd
+    found = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log).models[0]
+    lens, ids = found.camera(1), sorted(truth.reg_image_ids())
+    assert lens.model_name == model
+    assert len(lens.params) == len(params)
+    assert np.abs(lens.params[4:]).max() < 1.0
+    assert any(told in warning and model in warning for warning in log.warnings)
+    assert not any("no real lens" in warning for warning in log.warnings)
+    true_centers = centers(truth, ids)
+    errors, _ = align_positions(centers(found, ids), true_centers)
+    assert errors.mean() < 1e-3 * np.linalg.norm(true_centers - true_centers.mean(axis=0), axis=1).mean()
+    if given:
+        assert list(lens.params[4:]) == list(params[4:])
+
+
+def test_coefficients_that_the_photographs_tell_are_found_without_a_warning(tmp_path: Path) -> None:
+    params = (2600.0, 2600.0, 512.0, 384.0, -0.05, 0.01, 0.0, 0.0)
+    make_database(tmp_path / "a.db", num_images=8, num_points=60, noise_px=0.5, camera=("OPENCV", params))
+    log = StageLog()
+    map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log)
+    assert not log.warnings
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "FOV"])
+def test_lenses_far_from_where_they_start_are_adjusted_to_the_end(model: str, tmp_path: Path) -> None:
+    """One radial term stands for the lens at first; the focal length is 5 to 60 % off then."""
+    params = {"OPENCV": (600.0, 612.0, 600.0, 450.0, -0.12, 0.02, 0.001, -0.001), "FOV": LENSES["FOV"]}[model]
+    stored = camera(
+        model, {"OPENCV": (1440.0, 1440.0, 600.0, 450.0, *[0.0] * 4), "FOV": (780.0, 780.0, 600.0, 450.0, 0.01)}[model]
+    )
+    truth = write_room(tmp_path / "a.db", camera(model, params), stored)
+    found = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), StageLog()).models[0]
+    ids = sorted(found.reg_image_ids())
+    assert ids == list(range(1, NUM_IMAGES + 1))
+    errors, _ = align_positions(centers(found, ids), truth)
+    assert errors.mean() < 0.003 * 1.5
+    assert np.allclose(found.camera(1).params[:2], params[:2], rtol=0.01)

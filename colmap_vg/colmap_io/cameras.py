@@ -95,27 +95,43 @@ def with_focal_scale(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camer
 
 
 def has_radial_term(camera: "pycolmap.Camera") -> bool:
-    """Whether the camera's model distorts by a polynomial of the normalised radius."""
-    return camera.model_name in _DISTORTED_BY_POLYNOMIAL
+    """Whether the camera's model can take a radial term: polynomials of the normalised radius, and FOV."""
+    return camera.model_name in _DISTORTED_BY_POLYNOMIAL or camera.model_name == "FOV"
+
+
+def is_undistorted(camera: "pycolmap.Camera") -> bool:
+    """Whether a camera that can take a radial term has no distortion; FOV as COLMAP sets it up counts."""
+    largest = max((abs(camera.params[k]) for k in camera.extra_params_idxs()), default=0.0)
+    return largest <= (MIN_FOV_ANGLE if camera.model_name == "FOV" else 0.0)
 
 
 def with_radial_term(camera: "pycolmap.Camera", term: float) -> "pycolmap.Camera":
-    """Copy of a camera with a radial term more: exact where it had none, to first order elsewhere.
+    """Copy of a camera with a radial term more: exact for a polynomial that had none, to first order elsewhere.
 
     Parameters
     ----------
     camera : pycolmap.Camera
         With a radial term, see :func:`has_radial_term`.
     term : float
-        Of COLMAP's polynomial in normalised coordinates.
+        Of COLMAP's polynomial in normalised coordinates. FOV bends inwards only: what is positive is left out.
     """
     copy = pycolmap.Camera(camera.todict())
     params = np.array(copy.params, dtype=float)
-    params[_RADIAL_POWERS[copy.model_name][0][0]] += term
+    if copy.model_name == "FOV":
+        # atan(2 r tan(w / 2)) / w is slope * r * (1 - (2 tan(w / 2) r)^2 / 3 + ...), the slope 2 tan(w / 2) / w.
+        bent = 2.0 * np.tan(0.5 * max(abs(params[4]), MIN_FOV_ANGLE))
+        slope = bent / max(abs(params[4]), MIN_FOV_ANGLE)
+        bent = np.sqrt(max(bent**2 - 3.0 * term, MIN_FOV_ANGLE**2))
+        params[4] = 2.0 * np.arctan(0.5 * bent)
+        params[:2] *= slope / (bent / params[4])
+    else:
+        params[_RADIAL_POWERS[copy.model_name][0][0]] += term
     copy.params = params.tolist()
     return copy
 
 
+MIN_FOV_ANGLE = 0.01
+"""Radians; COLMAP's FOV lens without distortion."""
 _DISTORTED_BY_POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 _RADIAL_POWERS: dict[str, tuple[tuple[int, int], ...]] = {

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.cameras import has_radial_term, with_radial_term
+from colmap_vg.colmap_io.cameras import has_radial_term, is_undistorted, with_radial_term
 from colmap_vg.colmap_io.database import reading
 from colmap_vg.colmap_io.raw_matches import raw_matches, with_raw_matches
 from colmap_vg.colmap_io.tables import MAX_NUM_IMAGES, DatabaseTables
@@ -52,7 +52,7 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
     terms = np.zeros(len(tables.cameras))
     kinds: dict[object, list[int]] = {}
     for row, camera in enumerate(tables.cameras):
-        if has_radial_term(camera) and not any(camera.params[k] for k in camera.extra_params_idxs()):
+        if has_radial_term(camera) and is_undistorted(camera):
             kinds.setdefault((camera.model_name, camera.width, camera.height), []).append(row)
     caveats = []
     for rows in kinds.values():

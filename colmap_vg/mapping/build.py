@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from colmap_vg.mapping.bundle import adjust_bundle
+from colmap_vg.mapping.lenses import tame_lenses
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
     MIN_TRIANGULATION_ANGLE_DEG,
@@ -24,14 +26,15 @@ from colmap_vg.stages import StageLog
 MIN_SUPPORTED_OBSERVATIONS = 15
 """Observations of points seen in three views or more that an image needs to stay: three times what fixes a pose."""
 
-MAX_SANE_COEFFICIENT = 10.0
-"""Of a lens's distortion, in COLMAP's models; those of real lenses stay far below."""
 MAX_NUM_ROUNDS = 6
 """Rounds of adjusting and triangulating anew, at most."""
 GOOD_START_COST, SETTLED_COST = 0.5, 0.7
 """A round that leaves this share of its cost or more is the last: what is left then is noise. In the first round the
 noise of triangulation goes too; two thirds are left where the poses were good, and a third or less where they were not.
 After a good start a second round changed positions by 0.1 to 4 % and never for the better."""
+SETTLED_FOCAL = 0.01
+"""Relative change of a focal length in a round above which another follows, whatever the cost: lenses of several
+coefficients that start from one go down a long valley."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +97,14 @@ def build_model(
         mapper.complete_and_merge_tracks(triangulator)
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):
+        lenses = _focal_lengths(reconstruction)
         left, enough = _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4), GOOD_START_COST
         for _ in range(MAX_NUM_ROUNDS):
+            before, lenses = lenses, _focal_lengths(reconstruction)
             mapper.complete_and_merge_tracks(triangulator)
             mapper.retriangulate(triangulator)
             _filter(mapper)
-            if left >= enough:
+            if left >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= SETTLED_FOCAL:
                 break
             left, enough = _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5), SETTLED_COST
         else:
@@ -118,11 +123,22 @@ def build_model(
             again = _remove_unsupported(mapper)
             removed, added = removed | again, added - again
         log.result(f"{len(added)} images added, {len(removed)} removed")
+        tame_lenses(
+            reconstruction,
+            cache,
+            options,
+            log,
+            lambda held: _adjust(mapper, held, max_num_iterations=20, function_tolerance=1e-5),
+        )
         folded = _warn_of_folds(reconstruction, pairs, log)
-        _warn_of_lenses(reconstruction, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return BuildResult(frozenset(added), frozenset(removed), frozenset(misplaced), folded)
+
+
+def _focal_lengths(reconstruction: "pycolmap.Reconstruction") -> NDArray[np.float64]:
+    """Mean focal lengths of the cameras, pixels."""
+    return np.array([reconstruction.cameras[i].mean_focal_length() for i in sorted(reconstruction.cameras)])
 
 
 def adjust_once_more(
@@ -215,23 +231,6 @@ def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
         names = sorted(reconstruction.image(i).name for i in found.contradicted)
         log.warn(f"The pairs of {len(names)} images tell other rotations than the model (first: {names[0]}).")
     return len(found.detached) > 0
-
-
-def _warn_of_lenses(reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
-    """Warn of lenses whose coefficients make up for each other: narrow views do not tell the higher ones."""
-    used = sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()})
-    largest = {
-        camera_id: max((abs(lens.params[k]) for k in lens.extra_params_idxs()), default=0.0)
-        for camera_id, lens in ((camera_id, reconstruction.camera(camera_id)) for camera_id in used)
-    }
-    odd = [camera_id for camera_id in used if largest[camera_id] > MAX_SANE_COEFFICIENT]
-    if odd:
-        others = f", and of {len(odd) - 1} more" if len(odd) > 1 else ""
-        log.warn(
-            f"The {reconstruction.camera(odd[0]).model_name} lens of camera {odd[0]}{others} has coefficients up to"
-            f" {largest[odd[0]]:.3g}, which the photographs do not tell: it holds inside the images only. Use a simpler"
-            " camera model, or keep the coefficients (ba_refine_extra_params)."
-        )
 
 
 def _state(reconstruction: "pycolmap.Reconstruction") -> str:

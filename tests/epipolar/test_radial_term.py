@@ -81,3 +81,15 @@ def test_the_camera_shows_what_the_term_says() -> None:
     expected = shown(rays, -0.07)
     pixels = with_radial_term(camera, -0.07).img_from_cam(rays)
     np.testing.assert_allclose(pixels, FOCAL * expected[:, :2] / expected[:, 2:] + [500.0, 400.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.01, 0.6])
+def test_a_term_bends_an_fov_lens_as_a_polynomial(angle: float) -> None:
+    lens = pycolmap.Camera(model="FOV", width=100, height=80, params=[90.0, 90.0, 50.0, 40.0, angle])
+    bent = with_radial_term(lens, -0.2)
+    r = np.linspace(0.01, 0.1, 10)
+    rays = np.column_stack([r, np.zeros_like(r)])
+    before, after = (c.img_from_cam(np.column_stack([rays, np.ones(len(r))]))[:, 0] - 50.0 for c in (lens, bent))
+    # To first order in r^2; the fourth order of the atan is what is left.
+    assert np.allclose(after / before, 1.0 - 0.2 * r**2, atol=2.0 * r.max() ** 4)
+    assert np.allclose(with_radial_term(pycolmap.Camera(lens.todict()), 5.0).params[4], 0.01, atol=1e-6)
