@@ -33,8 +33,10 @@ GOOD_START_COST, SETTLED_COST = 0.5, 0.7
 noise of triangulation goes too; two thirds are left where the poses were good, and a third or less where they were not.
 After a good start a second round changed positions by 0.1 to 4 % and never for the better."""
 SETTLED_FOCAL = 0.01
-"""Relative change of a focal length in a round above which another follows, whatever the cost: lenses of several
-coefficients that start from one go down a long valley."""
+"""Relative change of a focal length in a round above which another follows, whatever the cost."""
+FOUND_WITH_THE_POSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
+"""Lenses of a focal length and one radial term start well. The others go down a long valley, where these would only
+follow what the photographs hardly tell, as the ratio of two focal lengths."""
 
 
 @dataclass(frozen=True)
@@ -137,8 +139,9 @@ def build_model(
 
 
 def _focal_lengths(reconstruction: "pycolmap.Reconstruction") -> NDArray[np.float64]:
-    """Mean focal lengths of the cameras, pixels."""
-    return np.array([reconstruction.cameras[i].mean_focal_length() for i in sorted(reconstruction.cameras)])
+    """Mean focal lengths of the cameras that start without some of their parameters, pixels."""
+    lenses = [lens for _, lens in sorted(reconstruction.cameras.items())]
+    return np.array([lens.mean_focal_length() for lens in lenses if lens.model_name not in FOUND_WITH_THE_POSES])
 
 
 def adjust_once_more(
