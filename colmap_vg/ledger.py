@@ -53,6 +53,7 @@ class Ledger:
         self._covariances: Array | None = None
         self._in_doubt: BoolArray | None = None
         self._arrangements: list[Array] = []
+        self._ratios = np.zeros((0, 2), dtype=np.int64)
 
     @property
     def usable(self) -> BoolArray:
@@ -103,10 +104,19 @@ class Ledger:
         self.image_verdicts[inside] = ImageVerdict.REGISTERED
         return Subgraph.of(self.graph.edges, inside, edges)
 
+    def note_ratios(self, edge_rows: IntArray) -> None:
+        """Note pairs (q, 2) of the graph's edges with a firm ratio of lengths, in place of earlier ones."""
+        self._ratios = edge_rows
+
     def largest_rigid_part(self, part: Subgraph, seed: int) -> Subgraph:
-        """Largest parallel-rigid part by edges with a direction; the part's other images become ``not_rigid``."""
+        """Largest part that directions and ratios of lengths fix; the part's other images become ``not_rigid``."""
         directed = self.edge_verdicts[part.edge_rows] == EdgeVerdict.KEPT
-        images, edges = largest_rigid_component(part.num_images, part.edges[directed], seed)
+        row = np.full(self.graph.num_edges, -1, dtype=np.int64)
+        row[part.edge_rows[directed]] = np.arange(int(directed.sum()))
+        ratios = row[self._ratios]
+        ratios = ratios[(ratios >= 0).all(axis=1)]
+        images, edges = largest_rigid_component(part.num_images, part.edges[directed], seed, ratios)
+        self.image_verdicts[part.images[images]] = ImageVerdict.REGISTERED
         self.image_verdicts[part.images[~images]] = ImageVerdict.NOT_RIGID
         inside = np.zeros(self.graph.num_images, dtype=bool)
         inside[part.images[images]] = True
@@ -226,7 +236,7 @@ def described(
     elsewhere = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
     if sum(elsewhere.values()) == len(image_verdicts):
         return SolutionStatus.UNSOLVABLE, (
-            "No three images are linked by directions that fix their positions: "
+            "No three images are linked by directions or tracks that fix their positions: "
             "add overlapping photographs, taken from different places."
         )
     status, message = SolutionStatus.SOLVED, f"All {len(image_verdicts)} images are registered."

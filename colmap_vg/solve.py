@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from colmap_vg.edge_residuals import edge_residual_sigmas, rotation_residuals
 from colmap_vg.edge_weights import edge_likelihoods, edge_weights
-from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
+from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar, edge_errors
 from colmap_vg.epipolar.baseline_lengths import connects_all, length_links, positions_by_lengths, solve_lengths
 from colmap_vg.epipolar.covariance import camera_covariances
 from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
@@ -59,6 +59,9 @@ those that leave together none is three times as certain as another."""
 CONTRADICTION = 10.0
 """Residuals of a pair over those of the median pair, in standard deviations, from which on it is false. What all pairs
 share, a lens not quite as modelled, is in the median; noise of one pair does not reach five."""
+MISFIT, MISFIT_PX = 3.0, 1.0
+"""Median error of a pair's matches at the adjusted cameras from which on they do not fit: over that of the median pair,
+and pixels."""
 TRUST_PER_MEDIAN, TRUST_SCALES_DEG = 20.0, (3.0, 10.0)
 """Geman-McClure scale of what a rotation's residual says of the direction, over the median residual, and its range. A
 false pair across a long street would otherwise fold it: it costs more displacement than tearing a street apart."""
@@ -83,7 +86,7 @@ _BASELINES = {
 def solve_view_graph(
     graph: ViewGraph, options: SolveOptions | None = None, initial_rotations: ArrayLike | None = None
 ) -> PoseSolution:
-    """Solve all rotations and positions of a viewing graph's parallel-rigid parts of three images or more.
+    """Solve all rotations and positions of those parts, of three images or more, that directions and tracks fix.
 
     Parameters
     ----------
@@ -241,8 +244,8 @@ def _admit_trials(ledger: Ledger, part: Subgraph, rotations: Array, options: Sol
 
 
 def _filter_directions(ledger: Ledger, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:
-    """The largest parallel-rigid part, after edges whose directions contradict the rest have gone."""
-    rigid = ledger.largest_rigid_part(part, options.random_seed)
+    """The largest part that its pairs fix, after edges whose directions contradict the rest have gone."""
+    rigid = _fixed_part(ledger, part, options)
     if rigid.num_images < 3 or options.outlier_filter == "none":
         return rigid
     own = rotations[part.rows_of(rigid.images)]
@@ -256,7 +259,23 @@ def _filter_directions(ledger: Ledger, part: Subgraph, rotations: Array, options
         weights = edge_weights(ledger.graph, rigid.edge_rows, options) * _rotation_trust(ledger.graph, rigid, own)
         _, angles = robust_direction_residuals(rigid.num_images, rigid.edges, directions, weights)
         ledger.drop(rigid.edge_rows[angles > np.radians(options.direction_gate_deg)], EdgeVerdict.DIRECTION_OUTLIER)
-    return ledger.largest_rigid_part(rigid, options.random_seed)
+    return _fixed_part(ledger, rigid, options)
+
+
+def _fixed_part(ledger: Ledger, part: Subgraph, options: SolveOptions) -> Subgraph:
+    """The largest part that directions fix or, where these leave images out, directions and tracks of three views."""
+    fixed = ledger.largest_rigid_part(part, options.random_seed)
+    if fixed.num_images == part.num_images or options.method != "epipolar":
+        return fixed
+    graph = ledger.graph
+    kept = part.with_edges(ledger.usable[part.edge_rows])
+    problem = epipolar_problem(graph, kept, options)
+    if problem is None:
+        return fixed
+    rows = kept.edge_rows
+    links = length_links(problem, graph.cam2_from_cam1_rotations[rows], graph.cam2_in_cam1_directions[rows])
+    ledger.note_ratios(rows[links.edges[links.firm]])
+    return ledger.largest_rigid_part(part, options.random_seed)
 
 
 def _rotation_trust(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:
@@ -397,10 +416,15 @@ def _adjust_epipolar(
     problem, found, radial_terms = _with_radial_term(ledger, problem, found, directions)
     ledger.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
     # Relative poses of bent rays contradict straight ones, right as both may be.
-    dropped = found.reversed_edges | (_contradicting(ledger, part, found) & (radial_terms is None))
+    dropped = found.reversed_edges | (_contradicting(ledger, part, problem, found) & (radial_terms is None))
     if dropped.sum() > found.reversed_edges.sum():
         ledger.drop(part.edge_rows[dropped & ~found.reversed_edges], EdgeVerdict.CONTRADICTS_POSES)
-        rest = replace(problem.without(dropped), free_focals=problem.free_focals & ~found.lost_focals)
+        rest = problem.without(dropped)
+        kept = part.with_edges(~dropped)
+        if ledger.largest_rigid_part(kept, options.random_seed).num_images < part.num_images:
+            # Tracks that were not needed before may hold what is left.
+            rest = epipolar_problem(ledger.graph, kept, options) or rest
+        rest = replace(rest, free_focals=problem.free_focals & ~found.lost_focals)
         again = adjust_epipolar(
             rest,
             found.cam_from_world_rotations,
@@ -420,7 +444,7 @@ def _adjust_epipolar(
         ledger.caveats.append(
             f"The matches do not tell the focal length of {count} of {len(group)} cameras; it stays as it was read."
         )
-    fixed = ledger.largest_rigid_part(part, options.random_seed) if dropped.any() else part
+    fixed = _fixed_part(ledger, part, options) if dropped.any() else part
     rows = part.rows_of(fixed.images)
     solved = _Poses(
         found.cam_from_world_rotations[rows],
@@ -461,8 +485,8 @@ def _with_radial_term(
     return lens.problem, again, np.asarray(terms)
 
 
-def _contradicting(ledger: Ledger, part: Subgraph, found: AdjustmentResult) -> BoolArray:
-    """Edges (e,) of a part whose relative poses no noise takes that far from the adjusted cameras."""
+def _contradicting(ledger: Ledger, part: Subgraph, problem: EpipolarProblem, found: AdjustmentResult) -> BoolArray:
+    """Edges (e,) of a part whose relative poses and matches no noise takes that far from the adjusted cameras."""
     graph, rows = ledger.graph, part.edge_rows
     if graph.edge_information is None:
         return np.zeros(len(rows), dtype=bool)
@@ -474,7 +498,12 @@ def _contradicting(ledger: Ledger, part: Subgraph, found: AdjustmentResult) -> B
         found.cam_from_world_rotations,
         found.projection_centers,
     )
-    return np.asarray((sigmas > CONTRADICTION * max(float(np.median(sigmas)), 1.0)) & ~ledger.trusted[rows])
+    contradicting = (sigmas > CONTRADICTION * max(float(np.median(sigmas)), 1.0)) & ~ledger.trusted[rows]
+    if contradicting.any():
+        # A pose by itself may be the worse of two that nearly explain a plane's matches.
+        errors = edge_errors(problem, found)
+        contradicting &= errors > max(MISFIT * float(np.median(errors)), MISFIT_PX)
+    return np.asarray(contradicting)
 
 
 def _world_directions(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:

@@ -56,7 +56,10 @@ class ImageVerdict(Verdict):
         "it is connected only to images outside the largest component, too few for a model of their own",
     )
     CUT_OFF = "cut_off", "all edges that linked it to the solved images were outliers"
-    NOT_RIGID = "not_rigid", "its edges do not fix its position relative to the others (for instance a single edge)"
+    NOT_RIGID = (
+        "not_rigid",
+        "neither the directions of its pairs nor tracks through three images fix its position relative to the others",
+    )
     UNCERTAIN = "uncertain", "its pairs fix its position to worse than a tenth of the scene's radius"
     MISPLACED = "misplaced", "points would place it where its pairs' relative poses contradict that"
     FEW_OBSERVATIONS = (

@@ -44,11 +44,14 @@ def without_still_background(
         return tables, np.zeros(len(still), dtype=bool)
     raw = with_raw_matches(tables, database_path, still)
     moving = _motions(raw) > MAX_STILL_PX
+    offsets = segment_subset(raw.offsets, moving)
+    if not (np.diff(offsets) >= MIN_NUM_MATCHES).any():
+        # Nothing turns: the camera stood still before a scene that did.
+        return tables, np.zeros(len(still), dtype=bool)
     caveat = (
         f"In {int(still.sum())} of {int(asked.sum())} pairs the background does not move with the object: matches that"
         f" stand still, {1.0 - moving.mean():.0%}, are left out. Masks of the background are safer."
     )
-    offsets = segment_subset(raw.offsets, moving)
     found = replace(
         raw,
         matches=raw.matches[moving],

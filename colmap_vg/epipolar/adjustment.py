@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_equations
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem
-from colmap_vg.epipolar.sampson import cauchy_costs, frames, normal_equations, residuals
+from colmap_vg.epipolar.sampson import cauchy_costs, frames, median_errors, normal_equations, residuals
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
@@ -227,6 +227,13 @@ def _in_stages(
         scale,
         tuple(log),
     )
+
+
+def edge_errors(problem: EpipolarProblem, found: AdjustmentResult) -> Array:
+    """Median Sampson error of each edge's matches at adjusted cameras, pixels: (m,)."""
+    cameras = Cameras(found.cam_from_world_rotations, found.projection_centers, np.log(found.focal_scales))
+    R, d, _ = cameras.relative(problem.edges)
+    return median_errors(problem.matches(cameras.log_scales), R, d)
 
 
 def _sigma(problem: EpipolarProblem, cameras: Cameras) -> float:

@@ -35,6 +35,8 @@ MEDIAN_TO_MEAN = 1.2533
 """Standard deviation of a median over that of a mean, normal noise."""
 LEAST_SIGMA = 0.02
 """Added to a link's noise, squared: what its rotations and directions have wrong is the same for all its tracks."""
+MAX_FIRM_SIGMA = 0.1
+"""Of a logarithm: a ratio that noise may have wrong by more than a tenth holds no position."""
 NUM_L1_TURNS, NUM_CAUCHY_TURNS, LENGTH_TOLERANCE = 8, 22, 1e-4
 RESIDUAL_SCALES = (2.0, 0.5, 0.2, 0.1)
 """Geman-McClure scales of positions' residuals in turn, shares of the edge's length."""
@@ -57,6 +59,11 @@ class LengthLinks:
     edges: IntArray
     log_ratios: Array
     sigmas: Array
+
+    @property
+    def firm(self) -> BoolArray:
+        """Links whose noise lets them hold positions, (q,)."""
+        return np.asarray(np.hypot(self.sigmas, LEAST_SIGMA) <= MAX_FIRM_SIGMA)
 
 
 def length_links(problem: EpipolarProblem, relative_rotations: Array, directions: Array) -> LengthLinks:

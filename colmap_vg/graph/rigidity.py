@@ -4,6 +4,10 @@ Directions along the edges of a graph fix all positions in general when the only
 translation and scaling of the whole (Ozyesil & Singer, CVPR 2015). A motion x keeps the direction of edge (i, j) when
 ``x_j - x_i = s_ij (p_j - p_i)``. Two edges belong to one rigid component when they have the same stretch ``s`` in every
 motion; for positions and a motion drawn at random that holds with probability one (Kennedy et al., IROS 2012).
+
+The known ratio of two edges' lengths keeps ``s_e = s_f`` and is one more equation of the motion. Its spanning argument:
+edges that ratios join, directly or through others, have one stretch, and where they connect images they fix these; what
+is left is rigidity between such bodies. The ranks of the full system of both are the same in general (see the tests).
 """
 
 import numpy as np
@@ -21,7 +25,9 @@ SAME_STRETCH = 1e-6
 """Stretches closer than this are taken as equal; a random motion separates components by about 1."""
 
 
-def largest_rigid_component(num_images: int, edges: IntArray, seed: int = 0) -> tuple[BoolArray, BoolArray]:
+def largest_rigid_component(
+    num_images: int, edges: IntArray, seed: int = 0, ratios: IntArray | None = None
+) -> tuple[BoolArray, BoolArray]:
     """Images and edges of the largest parallel-rigid component.
 
     Parameters
@@ -30,6 +36,8 @@ def largest_rigid_component(num_images: int, edges: IntArray, seed: int = 0) -> 
     edges : (m, 2) int array
     seed : int
         Of the random positions at which rigidity is tested.
+    ratios : (q, 2) int array, optional
+        Rows of edges the ratio of whose lengths is known.
 
     Returns
     -------
@@ -38,14 +46,14 @@ def largest_rigid_component(num_images: int, edges: IntArray, seed: int = 0) -> 
     edges : (m,) bool array
         Edges of that component.
     """
-    labels = rigid_components(num_images, edges, seed)
+    labels = rigid_components(num_images, edges, seed, ratios)
     inside = labels == 0
     images = np.zeros(num_images, dtype=bool)
     images[edges[inside].ravel()] = True
     return images, inside
 
 
-def rigid_components(num_images: int, edges: IntArray, seed: int = 0) -> IntArray:
+def rigid_components(num_images: int, edges: IntArray, seed: int = 0, ratios: IntArray | None = None) -> IntArray:
     """Rigid component of each edge, 0 for the one with most images. An image may lie in several components.
 
     Parameters
@@ -54,6 +62,8 @@ def rigid_components(num_images: int, edges: IntArray, seed: int = 0) -> IntArra
     edges : (m, 2) int array
         Parallel edges count once.
     seed : int
+    ratios : (q, 2) int array, optional
+        Rows of edges the ratio of whose lengths is known.
 
     Returns
     -------
@@ -67,7 +77,11 @@ def rigid_components(num_images: int, edges: IntArray, seed: int = 0) -> IntArra
     rest = np.flatnonzero(~inside)
     if len(rest):
         tested = np.concatenate([sparse_edges, edges[rest]])
-        found = _labels_by_stretch(num_images, tested, seed)
+        # All edges of the body have the stretch of its first.
+        row = np.zeros(len(edges), dtype=np.int64)
+        row[rest] = len(sparse_edges) + np.arange(len(rest))
+        equal = np.zeros((0, 2), dtype=np.int64) if ratios is None else row[ratios]
+        found = _labels_by_stretch(num_images, tested, seed, equal[equal[:, 0] != equal[:, 1]])
         labels[rest] = found[len(sparse_edges) :]
         labels[inside] = found[0]
     else:
@@ -107,8 +121,8 @@ def _grow_rigid_body(num_images: int, edges: IntArray) -> tuple[BoolArray, IntAr
     return body, np.concatenate([start[None], np.stack([rows[used], cols[used]], axis=1)]).astype(np.int64)
 
 
-def _labels_by_stretch(num_images: int, edges: IntArray, seed: int) -> IntArray:
-    """Groups of edges with the same stretch in a random motion that keeps all directions."""
+def _labels_by_stretch(num_images: int, edges: IntArray, seed: int, equal: IntArray) -> IntArray:
+    """Groups of edges of one stretch in a random motion that keeps directions, and the stretches of `equal` (q, 2)."""
     rng = np.random.default_rng(seed)
     p = rng.standard_normal((num_images, 3))
     d = p[edges[:, 1]] - p[edges[:, 0]]
@@ -116,20 +130,34 @@ def _labels_by_stretch(num_images: int, edges: IntArray, seed: int) -> IntArray:
     P = np.eye(3) - d[:, :, None] * d[:, None, :]
     damping = 1e-9
     pattern = BlockPattern(num_images, edges, 3)
-    factor = factorize(pattern.assemble(P, P, -P, np.tile(damping * np.eye(3), (num_images, 1, 1))))
+    matrix = pattern.assemble(P, P, -P, np.tile(damping * np.eye(3), (num_images, 1, 1)))
+    if len(equal):
+        difference = _stretches(num_images, edges, p)
+        difference = difference[equal[:, 0]] - difference[equal[:, 1]]
+        matrix = sp.csc_array(matrix + difference.T @ difference)
+    factor = factorize(matrix)
     x = rng.standard_normal(3 * num_images)
     # Inverse iteration: what is not a motion shrinks by damping / eigenvalue each time.
     for _ in range(4):
         x = damping * factor.solve(x)
         x /= np.linalg.norm(x) / np.sqrt(num_images)
     motion = x.reshape(num_images, 3)
-    length = np.einsum("ka,ka->k", d, p[edges[:, 1]] - p[edges[:, 0]])
-    stretch = np.einsum("ka,ka->k", d, motion[edges[:, 1]] - motion[edges[:, 0]]) / length
+    stretch = _stretches(num_images, edges, p) @ motion.ravel()
     order = np.argsort(stretch, kind="stable")
     groups = np.cumsum(np.concatenate([[0], np.diff(stretch[order]) > SAME_STRETCH]))
     labels = np.empty(len(edges), dtype=np.int64)
     labels[order] = groups
     return _split_disconnected(num_images, edges, labels)
+
+
+def _stretches(num_images: int, edges: IntArray, p: NDArray[np.float64]) -> sp.csr_array:
+    """The matrix (m, 3n) that takes motions to stretches ``(p_j - p_i) . (x_j - x_i) / |p_j - p_i|^2``."""
+    d = p[edges[:, 1]] - p[edges[:, 0]]
+    d /= np.sum(d**2, axis=1, keepdims=True)
+    columns = 3 * edges[:, :, None] + np.arange(3)
+    values = np.stack([-d, d], axis=1)
+    offsets = np.arange(0, 6 * len(edges) + 1, 6)
+    return sp.csr_array((values.ravel(), columns.ravel(), offsets), shape=(len(edges), 3 * num_images))
 
 
 def _split_disconnected(num_images: int, edges: IntArray, labels: IntArray) -> IntArray:

@@ -36,6 +36,10 @@ class Subgraph:
         inside = np.flatnonzero(kept & images[edges].all(axis=1))
         return cls(rows, inside, local[edges[inside]])
 
+    def with_edges(self, kept: BoolArray) -> "Subgraph":
+        """The same images, and those of its edges that are marked (e,)."""
+        return Subgraph(self.images, self.edge_rows[kept], self.edges[kept])
+
     @property
     def num_images(self) -> int:
         """Number of images k."""

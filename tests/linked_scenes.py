@@ -1,0 +1,88 @@
+"""Databases of scenes in which only chosen pairs are matched: streets, parts with few links, chains."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from synthetic_databases import changed_copy, look_at, pair_id
+
+WIDTH, HEIGHT, FOCAL = 1024, 768, 1000.0
+
+
+def write_scene(
+    path: Path,
+    poses: list[pycolmap.Rigid3d],
+    points: np.ndarray,
+    pairs: Iterable[tuple[int, int]],
+    noise_px: float = 0.5,
+    share_seen: float = 0.8,
+    seed: int = 0,
+) -> None:
+    """Images of points (k, 3), each seen by a share of the images that could, and the pairs matched and verified."""
+    rng = np.random.default_rng(seed)
+    lens = pycolmap.Camera(
+        camera_id=1, model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2]
+    )
+    lens.has_prior_focal_length = True
+    seen, pixels = [], []
+    for pose in poses:
+        local = points @ pose.rotation.matrix().T + pose.translation
+        front = np.flatnonzero(local[:, 2] > 0.1)
+        projected = np.asarray(lens.img_from_cam(local[front]))
+        found = (projected > 0).all(axis=1) & (projected < [WIDTH, HEIGHT]).all(axis=1)
+        found &= rng.random(len(found)) < share_seen
+        seen.append(front[found])
+        pixels.append(projected[found] + noise_px * rng.standard_normal((int(found.sum()), 2)))
+    pycolmap.set_random_seed(seed)
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        database.write_camera(lens, use_camera_id=True)
+        for row, own in enumerate(pixels):
+            database.write_image(
+                pycolmap.Image(name=f"{row:03d}.jpg", camera_id=1, image_id=row + 1), use_image_id=True
+            )
+            database.write_keypoints(row + 1, own.astype(np.float32))
+        for i, j in pairs:
+            _, a, b = np.intersect1d(seen[i], seen[j], return_indices=True)
+            matches = np.stack([a, b], axis=1).astype(np.uint32)
+            geometry = pycolmap.estimate_two_view_geometry(lens, pixels[i], lens, pixels[j], matches)
+            database.write_matches(i + 1, j + 1, matches)
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
+
+
+def near(count: int, reach: int) -> list[tuple[int, int]]:
+    """Pairs of a sequence not more than `reach` apart."""
+    return [(i, j) for i in range(count) for j in range(i + 1, min(i + reach, count - 1) + 1)]
+
+
+def street(num_images: int, seed: int = 0, num_points: int = 1500) -> tuple[list[pycolmap.Rigid3d], np.ndarray]:
+    """A walk along a façade, a step of a twentieth of its length at a time; poses and points."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(num_images) + 0.1 * rng.standard_normal(num_images)
+    places = np.stack([x, 0.1 * rng.standard_normal(num_images), 0.2 * rng.standard_normal(num_images)], axis=1)
+    aims = places + np.array([0.3, 0.0, 5.0]) + 0.2 * rng.standard_normal((num_images, 3))
+    low, high = np.array([-4.0, -2.0, 4.0]), np.array([num_images + 3.0, 2.0, 6.5])
+    return [look_at(c, a) for c, a in zip(places, aims, strict=True)], rng.uniform(low, high, (num_points, 3))
+
+
+def survey(columns: int, rows: int, seed: int = 0, num_points: int = 2000) -> tuple[list[pycolmap.Rigid3d], np.ndarray]:
+    """Photographs from above in a grid, and hilly ground below; poses and points."""
+    rng = np.random.default_rng(seed)
+    x, z = (a.ravel().astype(float) for a in np.meshgrid(np.arange(columns), np.arange(rows)))
+    places = np.stack([x, -4.0 + 0.2 * rng.standard_normal(len(x)), z], axis=1)
+    places[:, ::2] += 0.1 * rng.standard_normal((len(x), 2))
+    aims = places + np.array([0.0, 4.0, 0.5]) + 0.3 * rng.standard_normal((len(x), 3))
+    points = rng.uniform([-2.5, 0.0, -2.5], [columns + 1.5, 0.8, rows + 1.5], (num_points, 3))
+    return [look_at(c, a) for c, a in zip(places, aims, strict=True)], points
+
+
+def projection_centers(poses: list[pycolmap.Rigid3d]) -> np.ndarray:
+    """Centres (n, 3) of cam_from_world poses."""
+    return np.array([-pose.rotation.matrix().T @ pose.translation for pose in poses])
+
+
+def only_pairs(path: Path, target: Path, pairs: Iterable[tuple[int, int]]) -> Path:
+    """A copy of a database with the geometries of some pairs of image ids only."""
+    kept = ", ".join(str(pair_id(*sorted(pair))) for pair in pairs)
+    delete = "DELETE FROM {} WHERE pair_id NOT IN ({})"
+    return changed_copy(path, target, *(delete.format(table, kept) for table in ("matches", "two_view_geometries")))
