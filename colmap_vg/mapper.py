@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_vg.agreement import pair_agreement
 from colmap_vg.colmap_io.database import check_database
 from colmap_vg.colmap_io.quiet import quiet_colmap
+from colmap_vg.colmap_io.raw_matches import compared_pairs
 from colmap_vg.colmap_io.read import read_with_caveats
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
@@ -28,6 +29,7 @@ from colmap_vg.mapping.build import (
 from colmap_vg.mapping.colors import extract_colors
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
+from colmap_vg.mapping.weak_cuts import WeakCut, weak_cuts
 from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
@@ -56,11 +58,14 @@ class MappingResult:
     graph : ViewGraph
     solution : PoseSolution
         With the poses, focal factors and image verdicts of the finished model, in its frame; the rest as solved.
+    weak_cuts : tuple of tuples of WeakCut
+        Of each model: where few pairs hold it together, and what its points say of that.
     """
 
     models: dict[int, "pycolmap.Reconstruction"]
     graph: ViewGraph
     solution: PoseSolution
+    weak_cuts: tuple[tuple[WeakCut, ...], ...] = ()
 
 
 def view_graph_mapping(
@@ -144,6 +149,7 @@ def map_database(
                 f"{database_path}: {int((solution.component >= 0).sum())} poses were solved, but no three images share"
                 " points at an angle that could fix them; add overlapping photographs, taken from different places"
             )
+        cuts = _weak_cuts(database_path, graph, built, log)
         with log.stage("write"):
             staged = stage_models(work, len(built))
             for folder, model in zip(staged, built, strict=True):
@@ -154,7 +160,7 @@ def map_database(
             published = publish_models(staged, output_path)
             log.result(", ".join(map(str, published)))
     models = {index: model.reconstruction for index, model in enumerate(built)}
-    return MappingResult(models, graph, _as_in_models(solution, graph, built))
+    return MappingResult(models, graph, _as_in_models(solution, graph, built, cuts), cuts)
 
 
 @dataclass(frozen=True)
@@ -320,7 +326,30 @@ def _on_own_cameras(
     return model
 
 
-def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Model]) -> PoseSolution:
+def _weak_cuts(
+    database_path: str | PathLike[str], graph: ViewGraph, models: Sequence[_Model], log: StageLog
+) -> tuple[tuple[WeakCut, ...], ...]:
+    """Of each model, where few pairs hold it together; with a warning where its points speak against them."""
+    with log.stage("check"):
+        compared, pairs = compared_pairs(database_path), _pair_rotations(graph)
+        found = tuple(weak_cuts(model.reconstruction, pairs, compared) for model in models)
+        for model, cuts in zip(models, found, strict=True):
+            for cut in cuts:
+                if cut.contradicted:
+                    names = sorted(model.reconstruction.image(i).name for i in cut.images)
+                    log.warn(
+                        f"{len(names)} images ({names[0]} to {names[-1]}) are held to the rest of the model by"
+                        f" {cut.num_pairs} of their pairs, but of what both sides should see only {cut.share_seen:.2f}"
+                        f" is seen by both ({cut.share_seen_elsewhere:.2f} elsewhere). They may show another place"
+                        " that looks alike."
+                    )
+        log.result(f"{sum(map(len, found))} places where few pairs hold a model together")
+    return found
+
+
+def _as_in_models(
+    solution: PoseSolution, graph: ViewGraph, models: Sequence[_Model], cuts: Sequence[Sequence[WeakCut]]
+) -> PoseSolution:
     """The solution with the poses, focal lengths and image verdicts of the finished models."""
     words = solution.image_verdicts.astype(object)
     words[solution.component >= 0] = ImageVerdict.FEW_OBSERVATIONS
@@ -340,8 +369,12 @@ def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Mo
             centers[row] = image.projection_center()
         focal_scales = _focal_scales(focal_scales, graph, model)
     agreement = pair_agreement(graph, rotations, centers, component)
-    in_doubt = solution.in_doubt is not None or any(model.result.folded for model in models)
-    status, message = described(words, solution.converged, agreement, in_doubt)
+    contradicted = sorted(set().union(*(cut.images for of_model in cuts for cut in of_model if cut.contradicted)))
+    in_doubt = solution.in_doubt
+    if contradicted:
+        in_doubt = (False if in_doubt is None else in_doubt) | np.isin(solution.image_ids, contradicted)
+    doubtful = in_doubt is not None or any(model.result.folded for model in models)
+    status, message = described(words, solution.converged, agreement, doubtful)
     return replace(
         solution,
         position_covariances=_covariances_in_models(solution, centers, component),
@@ -354,6 +387,7 @@ def _as_in_models(solution: PoseSolution, graph: ViewGraph, models: Sequence[_Mo
         status=status,
         message=message,
         agreement=agreement,
+        in_doubt=in_doubt,
     )
 
 

@@ -133,27 +133,6 @@ def image_names(graph: ViewGraph) -> list[str]:
     return list(graph.image_names or map(str, graph.image_ids.tolist()))
 
 
-def bridges(graph: ViewGraph, solution: PoseSolution, num_shown: int = 10) -> list[dict[str, object]]:
-    """Pairs that link two models, by models; the strongest by name."""
-    names, ends = image_names(graph), np.sort(solution.component[graph.edges], axis=1)
-    linking = np.flatnonzero((ends[:, 0] >= 0) & (ends[:, 0] != ends[:, 1]))
-    inliers = np.zeros(graph.num_edges, dtype=np.int64) if graph.num_inliers is None else graph.num_inliers
-    found = []
-    for models in np.unique(ends[linking], axis=0):
-        rows = linking[(ends[linking] == models).all(axis=1)]
-        strongest = rows[np.argsort(-inliers[rows], kind="stable")][:num_shown]
-        pairs = [
-            {
-                "images": [names[a] for a in graph.edges[row]],
-                "verdict": str(solution.edge_verdicts[row]),
-                "num_inliers": int(inliers[row]),
-            }
-            for row in strongest
-        ]
-        found.append({"models": models.tolist(), "num_pairs": len(rows), "strongest": pairs})
-    return found
-
-
 def write_tables(output_path: Path, tables: VerdictTables) -> None:
     """Write both tables, each whole or not at all.
 
@@ -217,13 +196,14 @@ def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     return rows
 
 
-def explain_job(tables: VerdictTables) -> list[str]:
-    """Lines on all models, what was left out, and the pairs by verdict."""
+def explain_job(tables: VerdictTables, bridges: Sequence[str] = ()) -> list[str]:
+    """Lines on all models, what links them or holds them together, what was left out, and the pairs by verdict."""
     models = Counter(row.model for row in tables.images if row.model)
     lines = [
         f"model {model}: {count} images{_agreement(tables, model)}"
         for model, count in sorted(models.items(), key=lambda m: int(m[0]))
     ]
+    lines += [f"  {told}" for told in bridges]
     left_out = [row for row in tables.images if not row.model]
     lines.append(f"left out: {len(left_out)} of {len(tables.images)} images")
     lines += [f"  {row.image}: {row.verdict} ({image_reason(row.verdict)})" for row in left_out]

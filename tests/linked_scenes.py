@@ -18,8 +18,16 @@ def write_scene(
     noise_px: float = 0.5,
     share_seen: float = 0.8,
     seed: int = 0,
+    looks: np.ndarray | None = None,
+    compared: Iterable[tuple[int, int]] = (),
 ) -> None:
-    """Images of points (k, 3), each seen by a share of the images that could, and the pairs matched and verified."""
+    """Images of points (k, 3), each seen by a share of the images that could, and the pairs matched and verified.
+
+    Points of the same number in `looks` (k,) look alike and match; pairs in `compared` besides were found to have no
+    matches.
+    """
+    looks = np.arange(len(points)) if looks is None else looks
+    pairs = list(pairs)
     rng = np.random.default_rng(seed)
     lens = pycolmap.Camera(
         camera_id=1, model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2]
@@ -32,7 +40,7 @@ def write_scene(
         projected = np.asarray(lens.img_from_cam(local[front]))
         found = (projected > 0).all(axis=1) & (projected < [WIDTH, HEIGHT]).all(axis=1)
         found &= rng.random(len(found)) < share_seen
-        seen.append(front[found])
+        seen.append(looks[front[found]])
         pixels.append(projected[found] + noise_px * rng.standard_normal((int(found.sum()), 2)))
     pycolmap.set_random_seed(seed)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
@@ -48,6 +56,9 @@ def write_scene(
             geometry = pycolmap.estimate_two_view_geometry(lens, pixels[i], lens, pixels[j], matches)
             database.write_matches(i + 1, j + 1, matches)
             database.write_two_view_geometry(i + 1, j + 1, geometry)
+        for i, j in sorted(set(compared) - set(pairs)):
+            database.write_matches(i + 1, j + 1, np.zeros((0, 2), dtype=np.uint32))
+            database.write_two_view_geometry(i + 1, j + 1, pycolmap.TwoViewGeometry())
 
 
 def near(count: int, reach: int) -> list[tuple[int, int]]:
@@ -63,6 +74,21 @@ def street(num_images: int, seed: int = 0, num_points: int = 1500) -> tuple[list
     aims = places + np.array([0.3, 0.0, 5.0]) + 0.2 * rng.standard_normal((num_images, 3))
     low, high = np.array([-4.0, -2.0, 4.0]), np.array([num_images + 3.0, 2.0, 6.5])
     return [look_at(c, a) for c, a in zip(places, aims, strict=True)], rng.uniform(low, high, (num_points, 3))
+
+
+def alike_streets(
+    num_images: int, alike: float, seed: int = 0
+) -> tuple[list[pycolmap.Rigid3d], np.ndarray, np.ndarray]:
+    """Two streets, the same façade over a share of both, all else their own; poses, points, and looks of points."""
+    (poses, points), (others, elsewhere) = street(num_images, seed, 900), street(num_images, seed + 100, 900)
+    low, high = points[:, 0].min(), points[:, 0].max()
+    middle, half = (low + high) / 2.0, alike * (high - low) / 2.0
+    facade, own = (np.abs(x[:, 0] - middle) < half for x in (points, elsewhere))
+    second = np.concatenate([elsewhere[~own], points[facade]])
+    looks = np.concatenate([np.arange(len(points)), len(points) + np.arange((~own).sum()), np.flatnonzero(facade)])
+    away = np.array([1000.0, 0.0, 0.0])
+    moved = [pycolmap.Rigid3d(o.rotation, o.translation - o.rotation.matrix() @ away) for o in others]
+    return poses + moved, np.concatenate([points, second + away]), looks
 
 
 def survey(columns: int, rows: int, seed: int = 0, num_points: int = 2000) -> tuple[list[pycolmap.Rigid3d], np.ndarray]:

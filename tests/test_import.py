@@ -9,7 +9,7 @@ from pathlib import Path
 import colmap_vg
 
 ABOVE_THE_NUMERICS = (
-    *("cli", "report", "viewer", "demo", "image_folder", "mapper"),
+    *("cli", "report", "viewer", "demo", "image_folder", "mapper", "bridges"),
     *("mapping", "colmap_io", "features", "pixels"),
 )
 

@@ -68,6 +68,7 @@ def test_the_model_is_the_truth_within_the_noise(noisy: tuple[Path, pycolmap.Rec
         "triangulate",
         "adjust",
         "register",
+        "check",
         "write",
     ]
     written = pycolmap.Reconstruction(tmp_path / "0")

@@ -12,7 +12,6 @@ from colmap_vg.errors import DataFileError, OutputError
 from colmap_vg.geometry import so3
 from colmap_vg.synthetic import ring_scene
 from colmap_vg.verdict_tables import (
-    bridges,
     explain_image,
     explain_job,
     explain_pair,
@@ -83,20 +82,6 @@ def test_answers_name_verdict_and_reason(solved):
     with pytest.raises(DataFileError, match=r"did you mean .*4\.jpg"):
         explain_image(tables, "4.jpeg")
     assert "no verified pair" in explain_pair(tables, "broken.jpg", i)[0]
-
-
-def test_bridges_are_the_pairs_between_models(solved):
-    graph, solution = solved
-    assert bridges(graph, solution) == []
-    half = replace(solution, component=np.arange(10) // 5)
-    linking = np.flatnonzero((graph.edges // 5).sum(axis=1) == 1)
-    (found,) = bridges(graph, half, num_shown=2)
-    assert found["models"] == [0, 1]
-    assert found["num_pairs"] == len(linking)
-    strongest = linking[np.argsort(-graph.num_inliers[linking])][:2]
-    assert [pair["images"] for pair in found["strongest"]] == [
-        [graph.image_names[i] for i in graph.edges[row]] for row in strongest
-    ]
 
 
 @pytest.mark.parametrize("kind", [EdgeVerdict, ImageVerdict])

@@ -1,23 +1,32 @@
 """What the verbs do: the library's jobs, with their results shown and written to ``summary.json``."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pycolmap
 
+from colmap_vg.bridges import all_bridges
 from colmap_vg.cli.job_record import recorded_job
 from colmap_vg.cli.reporter import Reporter
-from colmap_vg.cli.summary import edge_summary, image_summary, job_summary, model_summary, plain, write_summary
+from colmap_vg.cli.summary import (
+    edge_summary,
+    image_summary,
+    job_summary,
+    model_summary,
+    plain,
+    told_bridges,
+    write_summary,
+)
 from colmap_vg.errors import MappingError
 from colmap_vg.image_folder import DATABASE_NAME, make_database
 from colmap_vg.mapper import MappingResult, map_database
+from colmap_vg.mapping.weak_cuts import WeakCut
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
 from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
 from colmap_vg.stages import StageLog
 from colmap_vg.verdict_tables import (
-    bridges,
     explain_image,
     explain_job,
     explain_pair,
@@ -192,7 +201,7 @@ def explain(output_path: Path, image: str | None, pair: tuple[str, str] | None) 
     tables = read_tables(output_path)
     if pair is not None:
         return explain_pair(tables, *pair)
-    return explain_job(tables) if image is None else explain_image(tables, image)
+    return explain_job(tables, told_bridges(output_path)) if image is None else explain_image(tables, image)
 
 
 def _finish(
@@ -206,7 +215,7 @@ def _finish(
 ) -> None:
     """Write the summary of a mapping job, and say what came out."""
     content = job_summary(verb, asked, reporter)
-    content |= _verdicts(mapped.graph, mapped.solution, output_path, skipped or {})
+    content |= _verdicts(mapped.graph, mapped.solution, output_path, skipped or {}, mapped.weak_cuts)
     content["models"] = [
         model_summary(output_path / str(index), model) | {"agreement": plain(mapped.solution.agreement[index])}
         for index, model in mapped.models.items()
@@ -219,7 +228,11 @@ def _finish(
 
 
 def _verdicts(
-    graph: ViewGraph, solution: PoseSolution, output_path: Path, skipped: Mapping[str, str]
+    graph: ViewGraph,
+    solution: PoseSolution,
+    output_path: Path,
+    skipped: Mapping[str, str],
+    weak_cuts: Sequence[Sequence[WeakCut]] = (),
 ) -> dict[str, object]:
     """The summary's part on images and pairs; the tables of all of them are written beside it."""
     write_tables(output_path, verdict_tables(graph, solution, skipped))
@@ -231,5 +244,5 @@ def _verdicts(
             [*(solution.component >= 0).tolist(), *[False] * len(skipped)],
         ),
         "edges": edge_summary(solution.edge_verdicts.tolist(), solution.edge_kept.tolist()),
-        "bridges": bridges(graph, solution),
+        "bridges": plain(all_bridges(graph, solution, weak_cuts)),
     }

@@ -84,6 +84,23 @@ def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
         raise OutputError(f"cannot write {output_path / FILE_NAME}: {error.strerror}") from error
 
 
+def told_bridges(output_path: Path) -> list[str]:
+    """What the summary of a finished job says of the links between and within its models.
+
+    Raises
+    ------
+    OutputError
+        There is no summary, or it is damaged.
+    """
+    path = output_path / FILE_NAME
+    try:
+        return [str(bridge["told"]) for bridge in json.loads(path.read_text(encoding="utf-8"))["bridges"]]
+    except OSError as error:
+        raise OutputError(f"cannot read {path}: {error.strerror}; run the job again") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise OutputError(f"{path} is damaged, or of another version: run the job again") from error
+
+
 def plain(value: object) -> object:
     """The value in JSON's types."""
     if is_dataclass(value) and not isinstance(value, type):

@@ -1,4 +1,4 @@
-"""Matches of a database as they were before verification."""
+"""Matches of a database as they were before verification, and which images were compared."""
 
 import sqlite3
 from dataclasses import replace
@@ -41,3 +41,13 @@ def with_raw_matches(tables: DatabaseTables, database_path: str | PathLike[str],
         matrix[marked] = np.nan
     offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
     return replace(tables, matches=np.concatenate(kept), offsets=offsets, **matrices)
+
+
+def compared_pairs(database_path: str | PathLike[str]) -> IntArray:
+    """Ids of images (k, 2) that were compared, matched or not: COLMAP stores pairs without matches, too."""
+    with reading(database_path) as connection:
+        tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        asked = [f"SELECT pair_id FROM {name}" for name in ("matches", "two_view_geometries") if name in tables]
+        found = connection.execute(" UNION ".join(asked)).fetchall()
+    pair_ids = np.array(found, dtype=np.int64).reshape(-1)
+    return np.stack([pair_ids // MAX_NUM_IMAGES, pair_ids % MAX_NUM_IMAGES], axis=1)

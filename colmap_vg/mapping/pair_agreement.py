@@ -65,20 +65,35 @@ def pair_agreement(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
         Pairs with an image outside the model do not count.
     """
     ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
-    inside = np.isin(pairs.image_ids, ids).all(axis=1)
-    edges = np.searchsorted(ids, pairs.image_ids[inside])
+    edges, matches, agree = _compared(reconstruction, ids, pairs)
     if len(edges) == 0:
         return PairAgreement(frozenset(), ())
-    rotations = np.array([reconstruction.image(i).cam_from_world().rotation.matrix() for i in ids.tolist()])
-    residuals = rotation_residuals(edges, pairs.cam2_from_cam1_rotations[inside], rotations)
-    agree = residuals <= np.radians(MAX_ROTATION_DEG)
-    matches = np.asarray(pairs.num_matches[inside], dtype=np.float64)
     whole, good = (
         np.bincount(edges.ravel(), weights=np.repeat(w, 2), minlength=len(ids)) for w in (matches, matches * agree)
     )
     number = np.bincount(edges[~agree].ravel(), minlength=len(ids))
     contradicted = frozenset(ids[(good < 0.5 * whole) & (number >= MIN_CONTRADICTING)].tolist())
     return PairAgreement(contradicted, _detached(ids, edges[agree], np.unique(edges)))
+
+
+def agreeing_pairs(
+    reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, pairs: PairRotations
+) -> tuple[IntArray, Array]:
+    """Pairs (m, 2) of rows of `image_ids`, rising, that agree with a model, and their numbers of matches (m,)."""
+    edges, matches, agree = _compared(reconstruction, image_ids, pairs)
+    return edges[agree], matches[agree]
+
+
+def _compared(
+    reconstruction: "pycolmap.Reconstruction", ids: IntArray, pairs: PairRotations
+) -> tuple[IntArray, Array, BoolArray]:
+    """Rows of the images of pairs inside the model (m, 2), their matches (m,), and whether they agree with it (m,)."""
+    inside = np.isin(pairs.image_ids, ids).all(axis=1)
+    edges = np.searchsorted(ids, pairs.image_ids[inside])
+    rotations = [reconstruction.image(i).cam_from_world().rotation.matrix() for i in ids.tolist()]
+    residuals = rotation_residuals(edges, pairs.cam2_from_cam1_rotations[inside], np.array(rotations).reshape(-1, 3, 3))
+    matches = np.asarray(pairs.num_matches[inside], dtype=np.float64)
+    return edges, matches, residuals <= np.radians(MAX_ROTATION_DEG)
 
 
 def _detached(ids: IntArray, edges: IntArray, with_pairs: IntArray) -> tuple[frozenset[int], ...]:

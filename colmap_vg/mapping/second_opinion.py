@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.mapping.options import MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG, triangulator_options
+from colmap_vg.mapping.visibility import NEAR_DEG, in_frame, sampled_tracks
 from colmap_vg.options import MappingOptions
 
 Array = NDArray[np.float64]
@@ -23,11 +24,6 @@ CLEARLY_MORE, MIN_SHARE_EXPLAINED = 1.2, 0.8
 """Share of what should be seen that is, over that in another arrangement of the images, which settles between them: 1.5
 to 2.5 where one was folded and part of the scene did not repeat itself, 1.0 between two folds. An arrangement whose
 points explain much fewer observations than another's does not count."""
-MAX_NUM_POINTS = 3000
-"""Points that are looked for in all images, the same share of each track length."""
-MIN_TRACK_LENGTH = 3
-NEAR_DEG = 15.0
-"""An image should see a point in its frame where another image sees it, at the point, from this near."""
 
 
 @dataclass(frozen=True)
@@ -80,22 +76,12 @@ def point_evidence(
     mapper.observation_manager.filter_all_points3D(MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG)
     mapper.end_reconstruction(False)
     image_ids = sorted(reconstruction.reg_image_ids())
-    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
-    tracks = [
-        (point.xyz, sorted({row_of[element.image_id] for element in point.track.elements}))
-        for _, point in sorted(reconstruction.points3D.items())
-    ]
-    tracks = sorted((t for t in tracks if len(t[1]) >= MIN_TRACK_LENGTH), key=lambda t: len(t[1]))
-    if not tracks:
+    tracks = sampled_tracks(reconstruction, image_ids)
+    if len(tracks.points) == 0:
         return PointEvidence(0, 0, 0)
-    looked_for = [tracks[k] for k in np.unique(np.linspace(0, len(tracks) - 1, MAX_NUM_POINTS).astype(int))]
-    xyz = np.array([position for position, _ in looked_for])
-    sees = np.zeros((len(looked_for), len(image_ids)), dtype=bool)
-    for row, (_, seen_in) in enumerate(looked_for):
-        sees[row, seen_in] = True
     centers = np.array([reconstruction.image(i).projection_center() for i in image_ids])
-    expected = _in_frame(reconstruction, image_ids, xyz) & _seen_from_near(xyz, centers, sees)
-    return PointEvidence(sum(len(seen) for _, seen in tracks), int(expected.sum()), int((expected & sees).sum()))
+    expected = in_frame(reconstruction, image_ids, tracks.points) & _seen_from_near(tracks.points, centers, tracks.sees)
+    return PointEvidence(tracks.num_observations, int(expected.sum()), int((expected & tracks.sees).sum()))
 
 
 def best_arrangement(found: Sequence[PointEvidence]) -> tuple[int, bool]:
@@ -119,20 +105,6 @@ def best_arrangement(found: Sequence[PointEvidence]) -> tuple[int, bool]:
         best = 0
     others = [share for k, share in enumerate(shares) if k != best]
     return best, shares[best] > 0.0 and shares[best] >= CLEARLY_MORE * max(others)
-
-
-def _in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xyz: Array) -> BoolArray:
-    """Points (k, 3) that project into each image, (k, n)."""
-    inside = np.zeros((len(xyz), len(image_ids)), dtype=bool)
-    for column, image_id in enumerate(image_ids):
-        image = reconstruction.image(image_id)
-        camera = reconstruction.camera(image.camera_id)
-        local = image.cam_from_world() * xyz
-        front = np.flatnonzero(local[:, 2] > 0)
-        pixels = np.asarray(camera.img_from_cam(local[front]), dtype=np.float64).reshape(-1, 2)
-        size = np.array([camera.width, camera.height])
-        inside[front, column] = ((pixels >= 0) & (pixels < size)).all(axis=1)
-    return inside
 
 
 def _seen_from_near(xyz: Array, centers: Array, sees: BoolArray) -> BoolArray:

@@ -1,0 +1,66 @@
+"""Places that look alike, joined by pairs that agree with each other, against one place with few links."""
+
+from itertools import combinations, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from linked_scenes import alike_streets, near, street, write_scene
+
+from colmap_vg import MappingOptions, SolutionStatus
+from colmap_vg.bridges import all_bridges
+from colmap_vg.mapper import MappingResult, map_database
+from colmap_vg.stages import StageLog
+
+NUM = 10
+
+
+def mapped(path: Path, out: Path) -> tuple[MappingResult, list[str]]:
+    log = StageLog()
+    return map_database(path, None, out, MappingOptions(), log), log.warnings
+
+
+@pytest.mark.parametrize("links", [1, 2, 4, 8])
+@pytest.mark.parametrize("alike", [0.2, 0.3])
+@pytest.mark.parametrize("seed", range(5))
+def test_streets_that_look_alike_are_doubted(seed: int, alike: float, links: int, tmp_path: Path) -> None:
+    poses, points, looks = alike_streets(NUM, alike, seed)
+    within = [(i, j) for i, j in near(2 * NUM, 3) if (i < NUM) == (j < NUM)]
+    middle = range(3, 7)
+    false = [(i, NUM + j) for i, j in product(middle, middle) if abs(i - j) <= 1]
+    chosen = np.random.default_rng(seed).permutation(len(false))[:links]
+    write_scene(
+        tmp_path / "a.db",
+        poses,
+        points,
+        within + [false[k] for k in chosen],
+        seed=seed,
+        looks=looks,
+        compared=combinations(range(2 * NUM), 2),
+    )
+    result, warnings = mapped(tmp_path / "a.db", tmp_path / "out")
+    parts = [{image_id <= NUM for image_id in model.reg_image_ids()} for model in result.models.values()]
+    if any(len(part) == 2 for part in parts):
+        assert result.solution.status == SolutionStatus.DOUBTFUL
+        marked = set(result.solution.image_ids[result.solution.in_doubt].tolist())
+        assert marked in (set(range(1, NUM + 1)), set(range(NUM + 1, 2 * NUM + 1)))
+        assert any("look alike" in told or "looks alike" in told for told in warnings)
+        assert any(not bridge.firm for bridge in all_bridges(result.graph, result.solution, result.weak_cuts))
+
+
+@pytest.mark.parametrize("links", [1, 2, 3])
+@pytest.mark.parametrize("all_compared", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_one_street_with_few_links_is_not(seed: int, all_compared: bool, links: int, tmp_path: Path) -> None:
+    poses, points = street(2 * NUM, seed)
+    pairs = [(i, j) for i, j in near(2 * NUM, 3) if (i < NUM) == (j < NUM)] + [(9, 10), (8, 10), (9, 11)][:links]
+    # Of what is further apart nothing was found, rightly.
+    apart = [(i, j) for i, j in combinations(range(2 * NUM), 2) if j - i > 4] if all_compared else []
+    write_scene(tmp_path / "a.db", poses, points, pairs, seed=seed, compared=apart)
+    result, warnings = mapped(tmp_path / "a.db", tmp_path / "out")
+    assert result.solution.status == SolutionStatus.SOLVED
+    assert not warnings
+    (bridge,) = (b for b in all_bridges(result.graph, result.solution, result.weak_cuts) if b.num_images == NUM)
+    assert bridge.num_pairs == links
+    assert bridge.firm
+    assert "is seen by both" in bridge.told
