@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.agreement import pair_agreement
 from colmap_vg.colmap_io.database import check_database
+from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.quiet import quiet_colmap
 from colmap_vg.colmap_io.raw_matches import compared_pairs
 from colmap_vg.colmap_io.read import read_with_caveats
@@ -27,9 +28,10 @@ from colmap_vg.mapping.build import (
     build_model,
 )
 from colmap_vg.mapping.colors import extract_colors
+from colmap_vg.mapping.join import Joint, joined_poses, joint_of
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
-from colmap_vg.mapping.weak_cuts import WeakCut, weak_cuts
+from colmap_vg.mapping.weak_cuts import WeakCut, cut_along, weak_cuts
 from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.solution import PoseSolution
@@ -165,10 +167,9 @@ def map_database(
 
 @dataclass(frozen=True)
 class _Model:
-    """A finished model, the component of the solution it comes from, and what changed on the way."""
+    """A finished model, and what changed on the way."""
 
     reconstruction: "pycolmap.Reconstruction"
-    component: int
     result: BuildResult
 
 
@@ -193,15 +194,18 @@ def _build(
             posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
         if replaced:
             log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
-    models, pairs = [], _pair_rotations(graph)
+    models: list[_Model] = []
+    pairs = _pair_rotations(graph)
     for component, reconstruction in enumerate(posed):
         others = frozenset(solution.image_ids[~np.isin(solution.component, (-1, component))].tolist())
         result = build_model(cache, reconstruction, options, log, others, pairs)
         if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() > 0:
-            models.append(_Model(reconstruction, component, result))
+            models.append(_Model(reconstruction, result))
         elif len(posed) > 1:
             count = int((solution.component == component).sum())
             log.warn(f"{count} images that seemed a model of their own share no points that could fix them.")
+    if len(models) > 1:
+        models = _joined(cache, models, graph, pairs, compared_pairs(database_path), options, log)
     if models and replaced:
         with (
             log.stage("cameras"),
@@ -212,6 +216,64 @@ def _build(
                 for m in models
             ]
     return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
+
+
+def _joined(
+    cache: "pycolmap.DatabaseCache",
+    models: list[_Model],
+    graph: ViewGraph,
+    pairs: PairRotations,
+    compared: NDArray[np.int64],
+    options: MappingOptions,
+    log: StageLog,
+) -> list[_Model]:
+    """The models, those put together that share points which agree on how they lie to each other."""
+    refused: set[frozenset[int]] = set()
+    while True:
+        with log.stage("join"):
+            models = sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
+            first, second, joint = _best_joint(models, graph, refused, options.random_seed)
+            if joint.similarity is None:
+                log.result("one model" if len(models) == 1 else f"{len(models)} models, no two of which share points")
+                return models
+            own, other = models[first].reconstruction, models[second].reconstruction
+            log.result(
+                f"models of {own.num_reg_images()} and {other.num_reg_images()} images share {joint.num_shared} points,"
+                f" {joint.num_agreeing} of which agree on how the two lie to each other"
+            )
+        posed = joined_poses(loaded_reconstruction(cache), own, other, joint.similarity)
+        both, moved = set(posed.reg_image_ids()), set(other.reg_image_ids())
+        elsewhere = frozenset(
+            i for k, m in enumerate(models) if k not in (first, second) for i in m.reconstruction.reg_image_ids()
+        )
+        result = build_model(cache, posed, options, log, elsewhere, pairs)
+        cut = cut_along(posed, pairs, compared, moved)
+        if both <= set(posed.reg_image_ids()) and not result.folded and not cut.contradicted:
+            rest = [model for k, model in enumerate(models) if k not in (first, second)]
+            models = [*rest, _Model(posed, result)]
+            continue
+        refused.add(frozenset(own.reg_image_ids()) | frozenset(moved))
+        log.warn(
+            f"Models of {own.num_reg_images()} and {len(moved)} images share points, but are not joined: adjusted"
+            f" together they lose {len(both - set(posed.reg_image_ids()))} images, and of what both should see"
+            f" {cut.share_seen:.2f} is seen by both ({cut.share_seen_elsewhere:.2f} elsewhere)."
+        )
+
+
+def _best_joint(
+    models: Sequence[_Model], graph: ViewGraph, refused: set[frozenset[int]], seed: int
+) -> tuple[int, int, Joint]:
+    """The two models that most shared points join; a joint without a similarity where there are none."""
+    best = 0, 0, Joint(0, 0, None)
+    for a, one in enumerate(models):
+        for b in range(a + 1, len(models)):
+            own, other = one.reconstruction, models[b].reconstruction
+            if frozenset(own.reg_image_ids()) | frozenset(other.reg_image_ids()) in refused:
+                continue
+            joint = joint_of(own, other, graph, seed)
+            if joint.similarity is not None and joint.num_agreeing > best[2].num_agreeing:
+                best = a, b, joint
+    return best
 
 
 def _second_opinion(
@@ -269,8 +331,8 @@ def _false_pairs(graph: ViewGraph, solution: PoseSolution) -> list[tuple[int, in
 
 
 def _pair_rotations(graph: ViewGraph) -> PairRotations:
-    """Of pairs whose matches have a pose of their own, whatever the solver thought of it."""
-    posed = graph.has_direction
+    """Of pairs whose matches have a rotation of their own, whatever the solver thought of it."""
+    posed = graph.has_rotation
     matches = np.ones(graph.num_edges) if graph.num_inliers is None else graph.num_inliers.astype(np.float64)
     return PairRotations(graph.image_ids[graph.edges[posed]], graph.cam2_from_cam1_rotations[posed], matches[posed])
 

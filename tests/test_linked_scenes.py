@@ -1,15 +1,19 @@
 """Scenes that hold together by what tracks through three images fix: chains, bridges, parts of few links."""
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-from linked_scenes import near, only_pairs, projection_centers, street, survey, write_scene
+from linked_scenes import alike_streets, near, only_pairs, projection_centers, street, survey, write_scene
 from synthetic_databases import centers
 
-from colmap_vg import align_positions, read_view_graph, solve_view_graph, view_graph_mapping
-from colmap_vg.verdicts import ImageVerdict
+from colmap_vg import MappingOptions, align_positions, read_view_graph, solve_view_graph, view_graph_mapping
+from colmap_vg.geometry import so3
+from colmap_vg.mapper import map_database
+from colmap_vg.stages import StageLog
+from colmap_vg.verdicts import EdgeVerdict, ImageVerdict
 
 
 def mean_error(model: pycolmap.Reconstruction, truth: dict[int, np.ndarray]) -> float:
@@ -66,6 +70,35 @@ def test_parts_of_a_survey_with_few_links_are_one_model(kind: str, tmp_path: Pat
     pairs = [(i, j) for i in range(42) for j in range(i + 1, 42) if close[i, j] and (i < first) == (j < first)]
     write_scene(tmp_path / "a.db", poses, points, pairs + links)
     check_one_model(tmp_path / "a.db", numbered(p), 0.0015, tmp_path / "out")
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 8.0, -8.0])
+def test_parts_whose_only_link_is_a_turn_on_the_spot_are_joined_by_points(turn_deg: float, tmp_path: Path) -> None:
+    poses, points = street(20, 1)
+    turn = so3.exp(np.radians([[0.0, turn_deg, 0.0]]))[0] @ poses[9].rotation.matrix()
+    place = projection_centers(poses)[9]
+    poses[10] = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ place)
+    pairs = [(i, j) for i, j in near(20, 3) if (i < 10) == (j < 10)] + [(9, 10)]
+    write_scene(tmp_path / "a.db", poses, points, pairs, seed=1)
+    graph = read_view_graph(tmp_path / "a.db")
+    assert graph.read_verdicts[(graph.edges == [9, 10]).all(axis=1)] == EdgeVerdict.ROTATION_ONLY
+    assert (solve_view_graph(graph).component == 1).sum() == 10
+    check_one_model(tmp_path / "a.db", numbered(projection_centers(poses)), 0.002, tmp_path / "out")
+
+
+@pytest.mark.parametrize("alike", [0.2, 0.3])
+def test_places_that_look_alike_are_not_joined_by_points(alike: float, tmp_path: Path) -> None:
+    poses, points, looks = alike_streets(10, alike, 0)
+    # The same view of both façades: as if the camera had not moved.
+    poses[15] = pycolmap.Rigid3d(
+        poses[5].rotation, poses[5].translation - poses[5].rotation.matrix() @ np.array([1000.0, 0.0, 0.0])
+    )
+    pairs = [(i, j) for i, j in near(20, 3) if (i < 10) == (j < 10)] + [(5, 15)]
+    write_scene(tmp_path / "a.db", poses, points, pairs, looks=looks, compared=combinations(range(20), 2))
+    log = StageLog()
+    models = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log).models
+    assert [set(m.reg_image_ids()) for m in models.values()] == [set(range(1, 11)), set(range(11, 21))]
+    assert any("share points, but are not joined" in told for told in log.warnings)
 
 
 def test_parts_without_a_link_stay_apart(tmp_path: Path) -> None:

@@ -29,6 +29,11 @@ class Similarity:
         """Transform points (n, 3)."""
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
+    def inverse(self) -> "Similarity":
+        """The similarity that takes it back."""
+        back = self.rotation.T / self.scale
+        return Similarity(1.0 / self.scale, self.rotation.T, -back @ self.translation)
+
 
 def align_positions(estimated: Array, truth: Array) -> tuple[Array, Similarity]:
     """Distances left after the similarity that best maps estimated on true positions, over all cameras.
@@ -59,12 +64,35 @@ def align_positions(estimated: Array, truth: Array) -> tuple[Array, Similarity]:
         )
     if not (np.isfinite(estimated).all() and np.isfinite(truth).all()):
         raise GraphError("align_positions: positions hold NaN or infinite values; leave unregistered images out first")
-    mean_p, mean_q = estimated.mean(axis=0), truth.mean(axis=0)
-    P, Q = estimated - mean_p, truth - mean_q
-    U, S, Vt = np.linalg.svd(Q.T @ P)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    rotation = (U * signs) @ Vt
-    spread = np.sum(P * P)
-    scale = float(np.sum(S * signs) / spread) if spread > 0 else 1.0
-    similarity = Similarity(scale, rotation, mean_q - scale * rotation @ mean_p)
+    scales, rotations, translations = best_similarities(estimated[None], truth[None])
+    if not np.isfinite(scales[0]):  # one position, or all at one place
+        similarity = Similarity(1.0, rotations[0], truth.mean(axis=0) - rotations[0] @ estimated.mean(axis=0))
+    else:
+        similarity = Similarity(float(scales[0]), rotations[0], translations[0])
     return np.linalg.norm(similarity.apply(estimated) - truth, axis=1), similarity
+
+
+def best_similarities(estimated: Array, truth: Array) -> tuple[Array, Array, Array]:
+    """Least-squares similarities of many sets of positions at once (Umeyama, PAMI 1991).
+
+    Parameters
+    ----------
+    estimated, truth : (h, n, 3) array
+
+    Returns
+    -------
+    scales : (h,) array
+        NaN where all estimated positions of a set are one.
+    rotations : (h, 3, 3) array
+    translations : (h, 3) array
+        ``truth ≈ scale rotation estimated + translation``.
+    """
+    mean_p, mean_q = estimated.mean(axis=1), truth.mean(axis=1)
+    P, Q = estimated - mean_p[:, None], truth - mean_q[:, None]
+    U, S, Vt = np.linalg.svd(np.swapaxes(Q, 1, 2) @ P)
+    signs = np.ones_like(S)
+    signs[:, 2] = np.sign(np.linalg.det(U @ Vt))
+    rotations = (U * signs[:, None]) @ Vt
+    spread = np.sum(P * P, axis=(1, 2))
+    scales = np.sum(S * signs, axis=1) / np.where(spread > 0, spread, np.nan)
+    return scales, rotations, mean_q - scales[:, None] * np.einsum("hab,hb->ha", rotations, mean_p)

@@ -6,6 +6,7 @@ parts are alike (missing correspondences, as in :mod:`colmap_vg.mapping.second_o
 compared count: what nobody matched is not missing.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,10 +89,32 @@ def weak_cuts(
     tuple of WeakCut
     """
     image_ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
-    edges, matches = agreeing_pairs(reconstruction, image_ids, pairs)
-    sides = _weak_sides(len(image_ids), edges, matches)
+    links = agreeing_pairs(reconstruction, image_ids, pairs)
+    return _judged(reconstruction, image_ids, links, compared, _weak_sides(len(image_ids), *links))
+
+
+def cut_along(
+    reconstruction: "pycolmap.Reconstruction", pairs: PairRotations, compared: IntArray, images: Iterable[int]
+) -> WeakCut:
+    """The cut between some images of a model, by their ids, and the rest; see :func:`weak_cuts`."""
+    image_ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
+    links = agreeing_pairs(reconstruction, image_ids, pairs)
+    side = np.isin(image_ids, sorted(images))
+    (cut,) = _judged(reconstruction, image_ids, links, compared, [(np.ones(len(image_ids), dtype=bool), side)])
+    return cut
+
+
+def _judged(
+    reconstruction: "pycolmap.Reconstruction",
+    image_ids: IntArray,
+    links: tuple[IntArray, Array],
+    compared: IntArray,
+    sides: list[tuple[BoolArray, BoolArray]],
+) -> tuple[WeakCut, ...]:
+    """Cuts of parts (n,) into a side (n,) and the rest, with what points say of them."""
     if not sides:
         return ()
+    edges, matches = links
     expected = _expected(reconstruction, image_ids, compared)
     found, whole = [], np.ones(len(image_ids), dtype=bool)
     for part, side in sides:

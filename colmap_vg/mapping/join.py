@@ -1,0 +1,158 @@
+"""Models that share points are parts of one: the similarity between them, and the poses of both in one frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.geometry.similarity import Similarity
+from colmap_vg.mapping.point_similarity import SeenPoints, similarity_of_points
+from colmap_vg.view_graph import ViewGraph
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+MIN_AGREEING = 10
+"""Points that agree on a similarity in both images; three fix it, and one does so by chance in 10^4."""
+MIN_SHARE_AGREEING = 0.5
+"""Of the points that both models have; where another half says otherwise, neither is believed."""
+MIN_FLATNESS = 0.05
+"""Second over first singular value of the points that agree: those along a line leave a turn about it."""
+NO_POINT = np.iinfo(np.uint64).max
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """What the points that two models share say of joining them.
+
+    Attributes
+    ----------
+    num_shared, num_agreeing : int
+        Points that verified matches identify, and those that agree on one similarity.
+    similarity : Similarity or None
+        From the second model's frame to the first's, where it is firm.
+    """
+
+    num_shared: int
+    num_agreeing: int
+    similarity: Similarity | None
+
+
+def joint_of(
+    own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction", graph: ViewGraph, seed: int = 0
+) -> Joint:
+    """Find the similarity between two models from the points that verified matches identify.
+
+    Parameters
+    ----------
+    own, other : pycolmap.Reconstruction
+        Of the same database, with points, without a common image.
+    graph : ViewGraph
+        With the keypoints of the matches of all pairs.
+    seed : int
+
+    Returns
+    -------
+    Joint
+    """
+    identified = list(_identified(own, other, graph))
+    if not identified:
+        return Joint(0, 0, None)
+    rows = np.concatenate(identified)
+    _, first = np.unique(rows[:, :2], axis=0, return_index=True)
+    rows = rows[np.sort(first)]
+    points = (
+        _seen_points(own, rows[:, 0], rows[:, 2], rows[:, 4]),
+        _seen_points(other, rows[:, 1], rows[:, 3], rows[:, 5]),
+    )
+    similarity, agree = similarity_of_points(*points, seed)
+    count = int(agree.sum())
+    firm = count >= max(MIN_AGREEING, MIN_SHARE_AGREEING * len(rows)) and _spread(points[0].points[agree])
+    return Joint(len(rows), count, similarity if firm else None)
+
+
+def joined_poses(
+    empty: "pycolmap.Reconstruction",
+    own: "pycolmap.Reconstruction",
+    other: "pycolmap.Reconstruction",
+    similarity: Similarity,
+) -> "pycolmap.Reconstruction":
+    """Both models' cameras and poses in the frame of the first, without points.
+
+    Parameters
+    ----------
+    empty : pycolmap.Reconstruction
+        With all images of the database, none registered; it is filled in place.
+    own, other : pycolmap.Reconstruction
+        Cameras of both have the first one's parameters.
+    similarity : Similarity
+        From the second one's frame to the first's.
+    """
+    for model in (other, own):
+        for camera_id in sorted({model.image(i).camera_id for i in model.reg_image_ids()}):
+            empty.camera(camera_id).params = model.camera(camera_id).params.tolist()
+    for model, moved in ((own, None), (other, similarity)):
+        for image_id in sorted(model.reg_image_ids()):
+            image = empty.image(image_id)
+            R, center = (
+                model.image(image_id).cam_from_world().rotation.matrix(),
+                model.image(image_id).projection_center(),
+            )
+            if moved is not None:
+                R, center = R @ moved.rotation.T, moved.apply(center[None])[0]
+            frame = empty.frame(image.frame_id)
+            frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center))
+            empty.register_frame(image.frame_id)
+    return empty
+
+
+def _spread(points: Array) -> bool:
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(singular[1] >= MIN_FLATNESS * singular[0])
+
+
+def _identified(
+    own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction", graph: ViewGraph
+) -> Iterator[IntArray]:
+    """Rows (point of own, of other, image of own, of other, keypoint in it, in the other) of each pair between them."""
+    offsets, keypoints1, keypoints2 = graph.inlier_offsets, graph.inlier_keypoints1, graph.inlier_keypoints2
+    if offsets is None or keypoints1 is None or keypoints2 is None:
+        return
+    ids = graph.image_ids[graph.edges]
+    sides = [np.isin(ids, sorted(model.reg_image_ids())) for model in (own, other)]
+    points: dict[int, IntArray] = {}
+    for edge in np.flatnonzero((sides[0] & sides[1][:, ::-1]).any(axis=1)).tolist():
+        rows = slice(*offsets[edge : edge + 2].tolist())
+        matches, images = np.stack([keypoints1[rows], keypoints2[rows]], axis=1).astype(np.int64), ids[edge]
+        if not sides[0][edge, 0]:
+            matches, images = matches[:, ::-1], images[::-1]
+        for model, image_id in zip((own, other), images.tolist(), strict=True):
+            if image_id not in points:
+                found = np.array([p.point3D_id for p in model.image(image_id).points2D], dtype=np.uint64)
+                points[image_id] = np.where(found == NO_POINT, 0, found).astype(np.int64)
+        seen = np.stack([points[i][m] for i, m in zip(images.tolist(), matches.T, strict=True)], axis=1)
+        both = (seen > 0).all(axis=1)
+        yield np.concatenate([seen[both], np.tile(images, (int(both.sum()), 1)), matches[both]], axis=1)
+
+
+def _seen_points(
+    model: "pycolmap.Reconstruction", point_ids: IntArray, image_ids: IntArray, keypoints: IntArray
+) -> SeenPoints:
+    unique, row = np.unique(image_ids, return_inverse=True)
+    images = [model.image(i) for i in unique.tolist()]
+    poses = [image.cam_from_world().rotation.matrix() for image in images]
+    coordinates, focal = np.full((len(row), 2), np.nan), np.zeros(len(row))
+    for k, image in enumerate(images):
+        own, camera = np.flatnonzero(row == k), model.camera(image.camera_id)
+        pixels = np.array([image.point2D(p).xy for p in keypoints[own].tolist()])
+        coordinates[own], focal[own] = camera.cam_from_img(pixels), camera.mean_focal_length()
+    return SeenPoints(
+        np.array([model.point3D(i).xyz for i in point_ids.tolist()]),
+        np.array(poses)[row],
+        np.array([image.projection_center() for image in images])[row],
+        coordinates,
+        focal,
+    )
