@@ -34,7 +34,9 @@ class SampledTracks:
     num_observations: int
 
 
-def sampled_tracks(reconstruction: "pycolmap.Reconstruction", image_ids: list[int]) -> SampledTracks:
+def sampled_tracks(
+    reconstruction: "pycolmap.Reconstruction", image_ids: list[int], max_num_points: int = MAX_NUM_POINTS
+) -> SampledTracks:
     """An even sample of a model's points by their tracks' lengths.
 
     Parameters
@@ -42,6 +44,7 @@ def sampled_tracks(reconstruction: "pycolmap.Reconstruction", image_ids: list[in
     reconstruction : pycolmap.Reconstruction
     image_ids : list of int
         All registered images; the columns of the result.
+    max_num_points : int
     """
     row_of = {image_id: row for row, image_id in enumerate(image_ids)}
     tracks = [
@@ -51,7 +54,7 @@ def sampled_tracks(reconstruction: "pycolmap.Reconstruction", image_ids: list[in
     tracks = sorted((t for t in tracks if len(t[1]) >= MIN_TRACK_LENGTH), key=lambda t: len(t[1]))
     if not tracks:
         return SampledTracks(np.zeros((0, 3)), np.zeros((0, len(image_ids)), dtype=bool), 0)
-    sampled = [tracks[k] for k in np.unique(np.linspace(0, len(tracks) - 1, MAX_NUM_POINTS).astype(int))]
+    sampled = [tracks[k] for k in np.unique(np.linspace(0, len(tracks) - 1, max_num_points).astype(int))]
     sees = np.zeros((len(sampled), len(image_ids)), dtype=bool)
     for row, (_, seen_in) in enumerate(sampled):
         sees[row, seen_in] = True

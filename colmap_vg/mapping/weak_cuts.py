@@ -29,6 +29,7 @@ MIN_IMAGES, MAX_NUM_CUTS = 3, 6
 """Of a side; and cuts that are looked at, of the largest parts first."""
 MAX_DISTANCE_RATIO = 1.3
 """Of two images from a point that both should see: along a street features are lost as they grow."""
+MAX_NUM_POINTS = 1500
 MIN_EXPECTED = 30
 """Observations, below which nothing can be told."""
 MIN_SHARE_OF_USUAL = 0.65
@@ -185,7 +186,7 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     rows = np.searchsorted(image_ids, compared[np.isin(compared, image_ids).all(axis=1)])
     were_compared = np.zeros((n, n), dtype=bool)
     were_compared[rows[:, 0], rows[:, 1]] = were_compared[rows[:, 1], rows[:, 0]] = True
-    tracks = sampled_tracks(reconstruction, ids)
+    tracks = sampled_tracks(reconstruction, ids, MAX_NUM_POINTS)
     visible = in_frame(reconstruction, ids, tracks.points)
     centers = np.array([reconstruction.image(i).projection_center() for i in ids])
     parts = []
