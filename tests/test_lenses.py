@@ -204,3 +204,18 @@ def test_lenses_far_from_where_they_start_are_adjusted_to_the_end(model: str, tm
     errors, _ = align_positions(centers(found, ids), truth)
     assert errors.mean() < 0.003 * 1.5
     assert np.allclose(found.camera(1).params[:2], params[:2], rtol=0.01)
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.5])
+def test_pixels_that_are_not_square_are_found_without_a_prior(noise_px: float, tmp_path: Path) -> None:
+    """Without noise the votes of pairs seem exact, while all of them are wrong by what one focal length leaves out."""
+    stored = camera("PINHOLE", (1440.0, 1440.0, 600.0, 450.0))
+    stored.has_prior_focal_length = False
+    truth = write_room(tmp_path / "a.db", camera("PINHOLE", (1040.0, 1092.0, 600.0, 450.0)), stored, noise_px, seed=1)
+    graph = read_view_graph(tmp_path / "a.db")
+    assert abs(graph.camera_focal_lengths[0] / 1066.0 - 1.0) < 0.08
+    found = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), StageLog()).models[0]
+    ids = sorted(found.reg_image_ids())
+    assert ids == list(range(1, NUM_IMAGES + 1))
+    errors, _ = align_positions(centers(found, ids), truth)
+    assert errors.mean() < 0.01 * 1.5

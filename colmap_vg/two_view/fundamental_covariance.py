@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _CAUCHY_SCALE = 2.385  # of sigma
-_MIN_SIGMA_PX = 0.05
+_MIN_SIGMA_PX = 0.15  # where matches fit better, what the lens model leaves out is all there is
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,3 +56,10 @@ def test_matches_beyond_the_effective_number_add_nothing():
     full = fundamental_covariances(offsets, points1, points2, F).covariances
     capped = fundamental_covariances(offsets, points1, points2, F, max_effective_matches=50).covariances
     np.testing.assert_allclose(capped, 3.0 * full, rtol=1e-6, atol=1e-9 * np.abs(full).max())
+
+
+def test_matches_without_noise_are_not_taken_for_exact():
+    # What the lens model leaves out is then all that is wrong, and votes for focal lengths would be sure of it.
+    offsets, points1, points2 = _draws(2, 150, 0.0)
+    F = estimate_fundamental_from_inliers(offsets, points1, points2)
+    assert fundamental_covariances(offsets, points1, points2, F).sigmas_px == pytest.approx(0.15)
