@@ -11,38 +11,38 @@ from colmap_vg._version import __version__
 
 _HOME = {
     "ColmapVgError": "errors",
-    "EdgeVerdict": "verdicts",
+    "EdgeVerdict": "scene.verdicts",
     "FeatureOptions": "options",
-    "ImageVerdict": "verdicts",
+    "ImageVerdict": "scene.verdicts",
     "MappingOptions": "options",
-    "PoseSolution": "solution",
+    "PoseSolution": "scene.solution",
     "ReadOptions": "options",
     "Similarity": "geometry.similarity",
-    "SolutionStatus": "verdicts",
+    "SolutionStatus": "scene.verdicts",
     "SolveOptions": "options",
-    "ViewGraph": "view_graph",
+    "ViewGraph": "scene.view_graph",
     "align_positions": "geometry.similarity",
-    "image_folder_mapping": "image_folder",
+    "image_folder_mapping": "jobs.image_folder",
     "read_1dsfm": "datasets.one_dsfm_folder",
     "read_bundle": "datasets.bundle",
-    "read_view_graph": "colmap_io.read",
-    "solve_view_graph": "solve",
-    "view_graph_mapping": "mapper",
+    "read_view_graph": "reading.read",
+    "solve_view_graph": "solver.solve",
+    "view_graph_mapping": "jobs.mapper",
 }
 
 if TYPE_CHECKING:
-    from colmap_vg.colmap_io.read import read_view_graph
     from colmap_vg.datasets.bundle import read_bundle
     from colmap_vg.datasets.one_dsfm_folder import read_1dsfm
     from colmap_vg.errors import ColmapVgError
     from colmap_vg.geometry.similarity import Similarity, align_positions
-    from colmap_vg.image_folder import image_folder_mapping
-    from colmap_vg.mapper import view_graph_mapping
+    from colmap_vg.jobs.image_folder import image_folder_mapping
+    from colmap_vg.jobs.mapper import view_graph_mapping
     from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
-    from colmap_vg.solution import PoseSolution
-    from colmap_vg.solve import solve_view_graph
-    from colmap_vg.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
-    from colmap_vg.view_graph import ViewGraph
+    from colmap_vg.reading.read import read_view_graph
+    from colmap_vg.scene.solution import PoseSolution
+    from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
+    from colmap_vg.scene.view_graph import ViewGraph
+    from colmap_vg.solver.solve import solve_view_graph
 
 __all__ = [
     "ColmapVgError",

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import lsmr
 
 from colmap_vg import ColmapVgError
 from colmap_vg.datasets.g2o import PoseGraph, read_g2o
-from colmap_vg.joint.pose_graph import solve_pose_graph
+from colmap_vg.pose_graph.gauss_newton import solve_pose_graph
 from colmap_vg.rotations.chordal import average_rotations_chordal
 
 

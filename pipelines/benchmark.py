@@ -19,18 +19,18 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from benchmark.growth import Timing, growth_table, looped_scene, timed_rotation_averaging, timed_solve
+from benchmark.mapper_runs import MAPPERS, MapperRun, alternate, compared
+from benchmark.photograph_runs import WAYS, PhotographRun, alternate_ways, compared_ways
+from paper.markdown import markdown_table
+from paper.scenes import set_conditions, simulated_scene, topology_sets
+from paper.svg import growth_svg
 
 import colmap_vg
-from colmap_vg.colmap_io.synthetic_database import write_synthetic_database
 from colmap_vg.demo.photographs import render_photographs
 from colmap_vg.options import Quality
-from colmap_vg.report.growth import Timing, growth_table, looped_scene, timed_rotation_averaging, timed_solve
-from colmap_vg.report.mapper_runs import MAPPERS, MapperRun, alternate, compared
-from colmap_vg.report.markdown import markdown_table
-from colmap_vg.report.photograph_runs import WAYS, PhotographRun, alternate_ways, compared_ways
-from colmap_vg.report.scenes import set_conditions, simulated_scene, topology_sets
-from colmap_vg.report.svg import growth_svg
-from colmap_vg.synthetic_views import SyntheticViews, synthetic_views
+from colmap_vg.simulation.database import write_synthetic_database
+from colmap_vg.simulation.views import SyntheticViews, synthetic_views
 
 QUICK_IMAGES, FULL_IMAGES = (30, 60), (50, 100, 200, 500, 1000, 2000)
 QUICK_EDGES, FULL_EDGES = (2_000, 8_000), (20_000, 100_000, 300_000, 1_000_000)

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import colmap_vg
-from colmap_vg.stages import StageEvent
+from colmap_vg.events import StageEvent
 
 
 def show(event: StageEvent) -> None:

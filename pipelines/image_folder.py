@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import get_args
 
 import colmap_vg
+from colmap_vg.events import StageEvent
 from colmap_vg.options import Matching
-from colmap_vg.stages import StageEvent
 
 
 def show(event: StageEvent) -> None:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from colmap_vg import SolutionStatus, solve_view_graph
 from colmap_vg.geometry import so3
-from colmap_vg.synthetic import SyntheticScene
-from colmap_vg.synthetic_objects import ObjectNoise, object_scene
+from colmap_vg.simulation.objects import ObjectNoise, object_scene
+from colmap_vg.simulation.ring_scenes import SyntheticScene
 
 Array = NDArray[np.float64]
 

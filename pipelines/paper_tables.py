@@ -13,11 +13,12 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import get_args
 
+from paper.position_table import PAPER_METHODS
+from paper.scenes import TABLE_1_SETS, set_conditions
+from paper.tables import SceneJob, SceneReport, measure_or_load, refuse_tables, write_tables
+
 import colmap_vg
 from colmap_vg.options import Method
-from colmap_vg.report.paper import SceneJob, SceneReport, measure_or_load, refuse_tables, write_tables
-from colmap_vg.report.position_table import PAPER_METHODS
-from colmap_vg.report.scenes import TABLE_1_SETS, set_conditions
 
 
 def main() -> None:

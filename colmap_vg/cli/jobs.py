@@ -6,10 +6,15 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_vg.bridges import all_bridges
-from colmap_vg.cli.job_record import recorded_job
 from colmap_vg.cli.reporter import Reporter
-from colmap_vg.cli.summary import (
+from colmap_vg.errors import MappingError
+from colmap_vg.events import StageLog
+from colmap_vg.jobs.bridges import all_bridges
+from colmap_vg.jobs.image_folder import DATABASE_NAME, make_database
+from colmap_vg.jobs.job_record import recorded_job
+from colmap_vg.jobs.mapper import MappingResult, map_database
+from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
+from colmap_vg.jobs.summary import (
     edge_summary,
     image_summary,
     job_summary,
@@ -18,15 +23,7 @@ from colmap_vg.cli.summary import (
     told_bridges,
     write_summary,
 )
-from colmap_vg.errors import MappingError
-from colmap_vg.image_folder import DATABASE_NAME, make_database
-from colmap_vg.mapper import MappingResult, map_database
-from colmap_vg.mapping.weak_cuts import WeakCut
-from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
-from colmap_vg.output_folder import publish_models, refuse_models, stage_models, work_folder
-from colmap_vg.solution import PoseSolution
-from colmap_vg.stages import StageLog
-from colmap_vg.verdict_tables import (
+from colmap_vg.jobs.verdict_tables import (
     explain_image,
     explain_job,
     explain_pair,
@@ -35,7 +32,10 @@ from colmap_vg.verdict_tables import (
     verdict_tables,
     write_tables,
 )
-from colmap_vg.view_graph import ViewGraph
+from colmap_vg.mapping.weak_cuts import WeakCut
+from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.scene.solution import PoseSolution
+from colmap_vg.scene.view_graph import ViewGraph
 
 DONE_BEFORE = "{}: this job came to its end before; nothing is left to do"
 
@@ -126,9 +126,9 @@ def _solve(
     asked: Mapping[str, object],
 ) -> None:
     from colmap_vg.colmap_io.database import check_database
-    from colmap_vg.colmap_io.read import read_with_caveats
     from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
-    from colmap_vg.solve import solve_view_graph
+    from colmap_vg.reading.read import read_with_caveats
+    from colmap_vg.solver.solve import solve_view_graph
 
     log = StageLog(reporter.on_event)
     check_database(database_path)
@@ -151,7 +151,7 @@ def _solve(
             for component, folder in enumerate(staged):
                 write_model(reconstruction_from_solution(cache, solution, graph, component), folder)
         log.result(", ".join(map(str, publish_models(staged, output_path))))
-    content = job_summary("solve", asked, reporter)
+    content = job_summary("solve", asked, reporter.records, reporter.warnings)
     content |= _verdicts(graph, solution, output_path, {})
     write_summary(output_path, content)
     names = image_names(graph)
@@ -214,7 +214,7 @@ def _finish(
     further: Mapping[str, object] | None = None,
 ) -> None:
     """Write the summary of a mapping job, and say what came out."""
-    content = job_summary(verb, asked, reporter)
+    content = job_summary(verb, asked, reporter.records, reporter.warnings)
     content |= _verdicts(mapped.graph, mapped.solution, output_path, skipped or {}, mapped.weak_cuts)
     content["models"] = [
         model_summary(output_path / str(index), model) | {"agreement": plain(mapped.solution.agreement[index])}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from colmap_vg.stages import StageEvent, StageRecord, peak_memory_mib
+from colmap_vg.events import StageEvent, StageRecord, peak_memory_mib
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -14,8 +14,8 @@ from colmap_vg.colmap_io.database import working_copy
 from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.shared_cameras import merge_cameras
 from colmap_vg.errors import DatabaseError, OutputError
-from colmap_vg.solution import PoseSolution
-from colmap_vg.view_graph import ViewGraph
+from colmap_vg.scene.solution import PoseSolution
+from colmap_vg.scene.view_graph import ViewGraph
 
 
 @contextmanager

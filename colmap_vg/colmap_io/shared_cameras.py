@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from colmap_vg.colmap_io.loading import loaded_reconstruction
-from colmap_vg.view_graph import ViewGraph
+from colmap_vg.scene.view_graph import ViewGraph
 
 
 def shared_cameras(graph: ViewGraph) -> list[list[int]]:

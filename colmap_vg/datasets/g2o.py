@@ -25,7 +25,7 @@ _NUM_VALUES = {_VERTEX: 8, _EDGE: 30}
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """A pose graph in this package's conventions, ready for :func:`colmap_vg.joint.pose_graph.solve_pose_graph`.
+    """A pose graph in this package's conventions, ready for :func:`colmap_vg.pose_graph.gauss_newton.solve_pose_graph`.
 
     Attributes
     ----------

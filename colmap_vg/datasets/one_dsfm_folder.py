@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_vg.datasets.rows import read_rows, read_text
 from colmap_vg.errors import DataFileError
 from colmap_vg.geometry import so3
-from colmap_vg.view_graph import ViewGraph
+from colmap_vg.scene.view_graph import ViewGraph
 
 BUNDLER_FROM_COLMAP_AXES = np.diag([1.0, -1.0, -1.0])
 """Bundler's camera axes from COLMAP's: y and z change sign. Its own inverse."""

@@ -12,13 +12,13 @@ import pycolmap
 
 from colmap_vg.demo.photographs import RING_RADIUS, TrueCameras, render_photographs, true_cameras, write_truth
 from colmap_vg.errors import OptionError, OutputError
+from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.similarity import align_positions
-from colmap_vg.image_folder import DATABASE_NAME, make_database
-from colmap_vg.mapper import MappingResult, map_database
+from colmap_vg.jobs.image_folder import DATABASE_NAME, make_database
+from colmap_vg.jobs.mapper import MappingResult, map_database
+from colmap_vg.jobs.output_folder import output_lock, work_folder
 from colmap_vg.options import FeatureOptions, MappingOptions
-from colmap_vg.output_folder import output_lock, work_folder
-from colmap_vg.stages import StageEvent, StageLog
 
 __all__ = ["DemoResult", "render_photographs", "run_demo"]
 

@@ -12,7 +12,7 @@ from colmap_vg.demo.exif import with_focal_length
 from colmap_vg.demo.render import RayCaster, photograph, pixel_rays
 from colmap_vg.demo.scene import build_ruin
 from colmap_vg.demo.texture import paint
-from colmap_vg.synthetic import look_at
+from colmap_vg.simulation.ring_scenes import look_at
 
 Array = NDArray[np.float64]
 

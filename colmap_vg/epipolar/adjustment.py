@@ -1,6 +1,6 @@
 """Epipolar adjustment: all rotations, positions and free focal lengths by the epipolar errors of all matches.
 
-No point is triangulated. The Cauchy cost of the Sampson errors (see :mod:`colmap_vg.epipolar.sampson`) of all edges is
+No point is triangulated. The Cauchy cost of the Sampson errors (see :mod:`colmap_vg.two_view.sampson`) of all edges is
 minimised over the cameras, ``R <- exp(w) R`` (w in the camera), ``p <- p + x``, by Levenberg's method on sparse blocks,
 together with that of the depths on which triplets of images must agree (see :mod:`colmap_vg.epipolar.depth_agreement`):
 each edge's normal equations by its five or seven parameters are carried to its cameras by the chain rule
@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_equations
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem
-from colmap_vg.epipolar.sampson import cauchy_costs, frames, median_errors, normal_equations, residuals
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
-from colmap_vg.robust import MAD_TO_SIGMA
-from colmap_vg.solution import LogEntry
+from colmap_vg.linear.robust_losses import MAD_TO_SIGMA
+from colmap_vg.scene.solution import LogEntry
+from colmap_vg.two_view.sampson import cauchy_costs, frames, median_errors, normal_equations, residuals
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

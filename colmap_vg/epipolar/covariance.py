@@ -22,9 +22,9 @@ from colmap_vg.epipolar.adjustment import AdjustmentResult, Cameras, edge_chain,
 from colmap_vg.epipolar.depth_agreement import depth_derivatives_by_block, depth_equations
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem
-from colmap_vg.epipolar.sampson import derivatives_by_block, normal_equations
 from colmap_vg.geometry import so3
-from colmap_vg.robust import MAD_TO_SIGMA, cauchy_weight
+from colmap_vg.linear.robust_losses import MAD_TO_SIGMA, cauchy_weight
+from colmap_vg.two_view.sampson import derivatives_by_block, normal_equations
 from colmap_vg.two_view.segments import segment_of_rows
 
 Array = NDArray[np.float64]

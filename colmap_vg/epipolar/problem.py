@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletRays
-from colmap_vg.epipolar.sampson import Matches, cut_rays
 from colmap_vg.epipolar.triplets import Triplets, find_triplets
 from colmap_vg.geometry.directions import normalized
-from colmap_vg.graph.subgraph import Subgraph
 from colmap_vg.options import SolveOptions
+from colmap_vg.scene.subgraph import Subgraph
+from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.two_view.pieces import Pieces
+from colmap_vg.two_view.sampson import Matches, cut_rays
 from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows, segment_subset
 from colmap_vg.two_view.spread import well_spread
-from colmap_vg.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from colmap_vg.epipolar.adjustment import AdjustmentResult, Cameras, adjust_epipolar
 from colmap_vg.epipolar.problem import EpipolarProblem
 
-Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 FIRST_STEP, MAX_TERM = 0.06, 0.6

@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 
 from colmap_vg.errors import ImageFolderError, OptionError
+from colmap_vg.events import StageLog
 from colmap_vg.features.masks import with_masks
 from colmap_vg.features.matching import match_features, restore_names
 from colmap_vg.features.photographs import (
@@ -26,7 +27,6 @@ from colmap_vg.features.photographs import (
 )
 from colmap_vg.features.staging import readable_folder
 from colmap_vg.options import FeatureOptions
-from colmap_vg.stages import StageLog
 
 UNREADABLE = "COLMAP cannot read it"
 

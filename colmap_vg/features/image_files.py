@@ -8,7 +8,7 @@ import re
 import struct
 import zlib
 
-from colmap_vg.pixels import decoded
+from colmap_vg.features.pixels import decoded
 
 _STANDALONE = frozenset([0x01, *range(0xD0, 0xD8)])
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}

@@ -23,11 +23,11 @@ import pycolmap
 
 from colmap_vg import errors
 from colmap_vg.errors import ColmapVgError, ImageFolderError, OutputError
+from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.features.extraction import extract_features
 from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import SkippedFile
 from colmap_vg.options import FeatureOptions
-from colmap_vg.stages import StageEvent, StageLog
 
 _TASKS: dict[str, Callable[..., object]] = {"features": extract_features, "matching": match_features}
 _LENGTH = struct.Struct("<Q")

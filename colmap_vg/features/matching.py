@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from colmap_vg.errors import ImageFolderError
+from colmap_vg.events import StageLog
 from colmap_vg.features.pair_selection import (
     num_strongest,
     preemptive_matches,
@@ -23,7 +24,6 @@ from colmap_vg.features.pair_selection import (
 )
 from colmap_vg.features.photographs import MIN_IMAGES
 from colmap_vg.options import FeatureOptions
-from colmap_vg.stages import StageLog
 
 MAX_EXHAUSTIVE = 20
 """Images; in larger folders ``auto`` chooses pairs before it matches them. Smaller ones have hardly a pair to save."""

@@ -15,8 +15,8 @@ import pycolmap
 
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.features.image_files import DamagedFileError, jpeg_size, png_header
+from colmap_vg.features.pixels import decoded
 from colmap_vg.options import CameraMode
-from colmap_vg.pixels import decoded
 
 MIN_IMAGES = 3
 """Images; two views have no redundancy that could tell a right model from a wrong one."""

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from colmap_vg.errors import ImageFolderError, OutputError
 from colmap_vg.features.photographs import Photograph
+from colmap_vg.features.pixels import stretched
 from colmap_vg.options import FeatureOptions
-from colmap_vg.pixels import stretched
 
 _AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 _MASKED_BELOW = 128

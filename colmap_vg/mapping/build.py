@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_vg.events import StageLog
 from colmap_vg.mapping.bundle import adjust_bundle
 from colmap_vg.mapping.lenses import tame_lenses
 from colmap_vg.mapping.options import (
@@ -21,7 +22,6 @@ from colmap_vg.mapping.options import (
 from colmap_vg.mapping.pair_agreement import PairRotations, pair_agreement
 from colmap_vg.mapping.support import supported_observations
 from colmap_vg.options import MappingOptions
-from colmap_vg.stages import StageLog
 
 MIN_SUPPORTED_OBSERVATIONS = 15
 """Observations of points seen in three views or more that an image needs to stay: three times what fixes a pose."""

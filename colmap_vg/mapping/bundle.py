@@ -8,10 +8,10 @@ import pycolmap
 import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
 from colmap_vg.geometry.directions import normalized
+from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY
 from colmap_vg.mapping.options import MIN_TRACK_LENGTH, bundle_options
 from colmap_vg.mapping.point_refinement import refine_points
 from colmap_vg.options import MappingOptions
-from colmap_vg.robust import EFFICIENT_CAUCHY
 
 RAYLEIGH_MEAN, MIN_SIGMA_PX, MAX_SCALE_PX = 1.2533, 0.1, 1.0
 """Mean length of two normal deviates of deviation 1; keypoints are no better than a tenth of a pixel."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.pixels import decoded, stretched
-from colmap_vg.stages import StageLog
+from colmap_vg.events import StageLog
+from colmap_vg.features.pixels import decoded, stretched
 
 if TYPE_CHECKING:
     import pycolmap

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry.similarity import Similarity
 from colmap_vg.mapping.point_similarity import SeenPoints, similarity_of_points
-from colmap_vg.view_graph import ViewGraph
+from colmap_vg.scene.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 MIN_AGREEING = 10
 """Points that agree on a similarity in both images; three fix it, and one does so by chance in 10^4."""

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pycolmap
 
+from colmap_vg.events import StageLog
 from colmap_vg.options import MappingOptions
-from colmap_vg.stages import StageLog
 
 MAX_SANE_COEFFICIENT = 10.0
 """Of a lens's distortion, in COLMAP's models; those of real lenses stay far below."""

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from colmap_vg.edge_residuals import rotation_residuals
+from colmap_vg.scene.edge_residuals import rotation_residuals
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry.directions import tangent_basis
 from colmap_vg.linear.assembly import sum_at_nodes
-from colmap_vg.robust import cauchy_loss, cauchy_weight
+from colmap_vg.linear.robust_losses import cauchy_loss, cauchy_weight
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

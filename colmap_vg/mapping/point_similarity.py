@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from colmap_vg.geometry.similarity import Similarity, align_positions, best_similarities
 
 Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 NUM_TRIALS = 400

@@ -14,10 +14,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.geometry.directions import normalized
-from colmap_vg.graph.components import components_by_size
-from colmap_vg.graph.normalized_cut import normalized_cut
 from colmap_vg.mapping.pair_agreement import PairRotations, agreeing_pairs
 from colmap_vg.mapping.visibility import NEAR_DEG, in_frame, sampled_tracks
+from colmap_vg.scene.components import components_by_size
+from colmap_vg.scene.normalized_cut import normalized_cut
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
 from colmap_vg.linear.solvers import factorize
 from colmap_vg.positions.result import PositionResult, centered, check_connected, unit_weights
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -13,7 +13,7 @@ from colmap_vg.linear.anderson import fixed_point
 from colmap_vg.linear.assembly import BlockPattern
 from colmap_vg.linear.solvers import factorize
 from colmap_vg.positions.result import PositionResult, check_connected, unit_weights
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

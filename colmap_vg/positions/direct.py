@@ -23,7 +23,7 @@ from colmap_vg.linear.solvers import SingularMatrixError, factorize
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.positions.fixed_point import solve_fixed_point
 from colmap_vg.positions.result import PositionResult, centered, check_connected, spread, unit_weights
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.positions.result import PositionResult, spread, unit_weights
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.errors import GraphError
-from colmap_vg.graph.components import components_by_size
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.components import components_by_size
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
+from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, cauchy_loss, cauchy_weight
 from colmap_vg.linear.solvers import Factor, factorize
 from colmap_vg.positions.result import PositionResult, centered, check_connected, spread, unit_weights
-from colmap_vg.robust import EFFICIENT_CAUCHY, cauchy_loss, cauchy_weight
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -7,7 +7,7 @@ other side. No start needs to find that other fold; it is a few images away.
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.rotations import quaternions
+from colmap_vg.geometry import quaternions
 from colmap_vg.rotations.votes import agree_within, count_votes
 
 Array = NDArray[np.float64]

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from colmap_vg.errors import GraphError
 from colmap_vg.linear.eigen import smallest_eigenpairs
 from colmap_vg.rotations.chordal_matrix import block_diagonal, chordal_cost, chordal_matrix
 from colmap_vg.rotations.problem import checked_initial, checked_problem
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from colmap_vg.linear.reweighted import ReweightedLaplacian
 from colmap_vg.linear.solvers import Factor, factorize
 from colmap_vg.rotations.chordal_matrix import TangentQuadratic, chordal_cost, chordal_matrix
 from colmap_vg.rotations.problem import RotationResult, checked_initial, checked_problem
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -13,7 +13,6 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.geometry import so3
 from colmap_vg.rotations.alternatives import nearest_alternative
 from colmap_vg.rotations.cycles import closing_shares, rival_share
@@ -21,7 +20,8 @@ from colmap_vg.rotations.refinement import AGREEMENT_DEG, capped_likelihoods, re
 from colmap_vg.rotations.robust import average_rotations_robust
 from colmap_vg.rotations.spanning_tree import spanning_tree
 from colmap_vg.rotations.votes import rotations_by_votes
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.edge_residuals import rotation_residuals
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -8,7 +8,7 @@ one opinion among others.
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.rotations import quaternions
+from colmap_vg.geometry import quaternions
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

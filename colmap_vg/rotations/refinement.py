@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.rotations.robust import average_rotations_robust
-from colmap_vg.solution import LogEntry
+from colmap_vg.scene.edge_residuals import rotation_residuals
+from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -8,7 +8,7 @@ first. A false edge, however strong, is outvoted once clusters have formed.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from colmap_vg.rotations import quaternions
+from colmap_vg.geometry import quaternions
 from colmap_vg.rotations.problem import checked_problem
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ fitting (Hartley & Zisserman §11.4.3).
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.robust import cauchy_weight
+from colmap_vg.linear.robust_losses import cauchy_weight
 from colmap_vg.two_view.essential import nearest_essential
 from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import segment_quantiles, segment_sums

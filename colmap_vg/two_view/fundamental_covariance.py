@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.robust import cauchy_weight
+from colmap_vg.linear.robust_losses import cauchy_weight
 from colmap_vg.two_view.eight_point import cofactors, weighted_moments
 from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import segment_quantiles

@@ -8,18 +8,18 @@ import pytest
 from epipolar_scenes import pixel_scene
 
 from colmap_vg import read_view_graph, solve_view_graph
-from colmap_vg.colmap_io.synthetic_database import write_synthetic_database
+from colmap_vg.calibration.self_calibration import estimate_focal_lengths
 from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient, gauged
-from colmap_vg.epipolar.edge_information import refine_relative_poses
 from colmap_vg.epipolar.problem import EpipolarProblem
-from colmap_vg.epipolar.self_calibration import estimate_focal_lengths
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
-from colmap_vg.joint.alternation import solve_joint
+from colmap_vg.pose_graph.alternation import solve_joint
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.rotations.robust import average_rotations_robust
-from colmap_vg.synthetic import ring_scene
-from colmap_vg.synthetic_views import synthetic_views
+from colmap_vg.simulation.database import write_synthetic_database
+from colmap_vg.simulation.ring_scenes import ring_scene
+from colmap_vg.simulation.views import synthetic_views
+from colmap_vg.two_view.edge_information import refine_relative_poses
 
 NUM_CAMERAS, NUM_MATCHES = 1000, 300_000
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from colmap_vg.cli.reporter import Reporter
-from colmap_vg.cli.summary import edge_summary, image_summary, job_summary, write_summary
 from colmap_vg.errors import OutputError
+from colmap_vg.events import StageLog
+from colmap_vg.jobs.summary import edge_summary, image_summary, job_summary, write_summary
 from colmap_vg.options import MappingOptions
-from colmap_vg.stages import StageLog
 
 
 def some_job(reporter: Reporter) -> None:
@@ -62,7 +62,9 @@ def test_a_terminal_gets_lines_with_brackets_unharmed(
 def test_summary_is_plain_json(tmp_path: Path) -> None:
     reporter = Reporter(quiet=True)
     some_job(reporter)
-    content = job_summary("mapper", {"output_path": tmp_path, "mapping": MappingOptions()}, reporter)
+    content = job_summary(
+        "mapper", {"output_path": tmp_path, "mapping": MappingOptions()}, reporter.records, reporter.warnings
+    )
     content["images"] = image_summary(["a", "b", "c"], ["registered", "no_edges", "registered"], [True, False, True])
     content["edges"] = edge_summary(
         ["kept", "reversed", "kept", "reversed", "watermark"], [True, False, True, False, False]

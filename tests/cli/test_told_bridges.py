@@ -7,8 +7,8 @@ from linked_scenes import near, street, write_scene
 
 from colmap_vg.cli.jobs import explain, mapper
 from colmap_vg.cli.reporter import Reporter
-from colmap_vg.cli.summary import told_bridges
 from colmap_vg.errors import OutputError
+from colmap_vg.jobs.summary import told_bridges
 from colmap_vg.options import MappingOptions
 
 

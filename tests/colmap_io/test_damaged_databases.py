@@ -10,12 +10,12 @@ import pytest
 from synthetic_databases import DAMAGES, changed_copy, make_database, sha256
 
 from colmap_vg.colmap_io.database import check_database, reading, working_copy
-from colmap_vg.colmap_io.read import read_view_graph
 from colmap_vg.errors import DatabaseError
-from colmap_vg.mapper import view_graph_mapping
+from colmap_vg.jobs.mapper import view_graph_mapping
 from colmap_vg.options import MappingOptions
-from colmap_vg.solution import SolutionStatus
-from colmap_vg.solve import solve_view_graph
+from colmap_vg.reading.read import read_view_graph
+from colmap_vg.scene.solution import SolutionStatus
+from colmap_vg.solver.solve import solve_view_graph
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ from synthetic_databases import make_database
 
 from colmap_vg.colmap_io import memory
 from colmap_vg.colmap_io.memory import BYTES_PER_MATCH, USABLE_SHARE, affordable_matches_per_pair, available_memory
-from colmap_vg.colmap_io.read import read_with_caveats
 from colmap_vg.colmap_io.tables import read_tables
 from colmap_vg.errors import DatabaseError
 from colmap_vg.options import ReadOptions
+from colmap_vg.reading.read import read_with_caveats
 
 
 def room_for(num_matches: float) -> float:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from synthetic_databases import make_database, sha256, with_other_ids
 
-from colmap_vg.colmap_io.read import read_view_graph
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
 from colmap_vg.errors import DatabaseError
-from colmap_vg.solution import PoseSolution
-from colmap_vg.solve import solve_view_graph
-from colmap_vg.view_graph import ViewGraph
+from colmap_vg.reading.read import read_view_graph
+from colmap_vg.scene.solution import PoseSolution
+from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.solver.solve import solve_view_graph
 
 RADIAL = ("SIMPLE_RADIAL", (1280.0, 512.0, 384.0, 0.05))
 

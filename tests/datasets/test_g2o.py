@@ -6,7 +6,7 @@ import pytest
 from colmap_vg.datasets.g2o import read_g2o
 from colmap_vg.errors import DataFileError
 from colmap_vg.geometry import so3
-from colmap_vg.joint.costs import InformationCost
+from colmap_vg.pose_graph.costs import InformationCost
 
 UPPER = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
 

@@ -7,7 +7,7 @@ import colmap_vg
 from colmap_vg.datasets.one_dsfm_folder import BUNDLER_FROM_COLMAP_AXES
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
-from colmap_vg.synthetic import ring_scene
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 F = BUNDLER_FROM_COLMAP_AXES
 

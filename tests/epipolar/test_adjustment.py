@@ -14,7 +14,7 @@ from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.geometry.similarity import align_positions
-from colmap_vg.synthetic import nearest_neighbor_edges, ring_cameras
+from colmap_vg.simulation.ring_scenes import nearest_neighbor_edges, ring_cameras
 
 
 def scene(seed, *, num_images=8, num_matches=40, sigma_px=0.0, focal=1000.0, wrong=1.0, num_cameras=2, free=False):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from epipolar.image_sets import image_set
+from image_sets import image_set
 
 from colmap_vg.epipolar import baseline_lengths
 from colmap_vg.epipolar.baseline_lengths import (

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from epipolar.image_sets import FOCAL, image_set
+from image_sets import FOCAL, image_set
 
 from colmap_vg import align_positions
 from colmap_vg.colmap_io.cameras import has_radial_term, with_radial_term

@@ -13,12 +13,12 @@ import pytest
 from rendered_corner import Corner, render_corner, write_jpeg
 
 from colmap_vg.errors import ImageFolderError
+from colmap_vg.events import StageLog
 from colmap_vg.features import matching
 from colmap_vg.features.extraction import extract_and_match
 from colmap_vg.features.matching import match_features, match_pairs, promising_pairs, restore_names, sequential_pairs
 from colmap_vg.features.pair_selection import select_pairs
 from colmap_vg.options import FeatureOptions
-from colmap_vg.stages import StageLog
 
 QUICK = FeatureOptions(num_threads=2, max_num_features=500, max_image_size=240)
 NAMES = ("a photo (1).jpg", "#2.jpg", "füñf/100 %.jpg", "plain.jpg")

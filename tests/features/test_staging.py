@@ -9,12 +9,12 @@ import pytest
 from rendered_corner import HEIGHT, WIDTH, render_corner, write_jpeg
 
 from colmap_vg.errors import ImageFolderError
+from colmap_vg.events import StageLog
 from colmap_vg.features.extraction import extract_and_match
 from colmap_vg.features.photographs import find_photographs
-from colmap_vg.image_folder import make_database
+from colmap_vg.features.pixels import stretched
+from colmap_vg.jobs.image_folder import make_database
 from colmap_vg.options import FeatureOptions
-from colmap_vg.pixels import stretched
-from colmap_vg.stages import StageLog
 
 QUICK = {"num_threads": 2, "max_num_features": 500, "max_image_size": 240}
 

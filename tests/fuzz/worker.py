@@ -10,18 +10,18 @@ import sys
 import warnings
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "scenes"))
 
 import numpy as np
 import pycolmap
-from fuzz.damaged_databases import damaged, sound_databases
-from fuzz.odd_graphs import odd_case
+from damaged_databases import damaged, sound_databases
+from odd_graphs import odd_case
 
 from colmap_vg.errors import ColmapVgError
-from colmap_vg.mapper import view_graph_mapping
+from colmap_vg.jobs.mapper import view_graph_mapping
 from colmap_vg.options import MappingOptions, SolveOptions
-from colmap_vg.solve import solve_view_graph
-from colmap_vg.view_graph import ViewGraph
+from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.solver.solve import solve_view_graph
 
 
 def database_case(seed: int, sound: list[Path], folder: Path) -> str:

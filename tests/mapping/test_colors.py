@@ -9,8 +9,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 from synthetic_databases import make_database
 
+from colmap_vg.events import StageLog
 from colmap_vg.mapping.colors import extract_colors, interpolated
-from colmap_vg.stages import StageLog
 
 COLOR = (200, 100, 50)
 

@@ -5,10 +5,10 @@ import pycolmap
 import pytest
 from synthetic_databases import PINHOLE
 
+from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
 from colmap_vg.mapping import build
 from colmap_vg.mapping.pair_agreement import PairRotations, pair_agreement
-from colmap_vg.stages import StageLog
 
 
 def make_model(num_images: int) -> pycolmap.Reconstruction:

@@ -10,11 +10,11 @@ from synthetic_databases import make_database
 
 from colmap_vg import MappingOptions, SolutionStatus, read_view_graph, solve_view_graph
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
-from colmap_vg.colmap_io.synthetic_database import write_synthetic_database
+from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
-from colmap_vg.mapper import map_database
+from colmap_vg.jobs.mapper import map_database
 from colmap_vg.mapping.second_opinion import NEAR_DEG, PointEvidence, best_arrangement, point_evidence
-from colmap_vg.stages import StageLog
+from colmap_vg.simulation.database import write_synthetic_database
 
 
 def _num_folded(solution, views):

@@ -8,9 +8,9 @@ import pytest
 from linked_scenes import alike_streets, near, street, write_scene
 
 from colmap_vg import MappingOptions, SolutionStatus
-from colmap_vg.bridges import all_bridges
-from colmap_vg.mapper import MappingResult, map_database
-from colmap_vg.stages import StageLog
+from colmap_vg.events import StageLog
+from colmap_vg.jobs.bridges import all_bridges
+from colmap_vg.jobs.mapper import MappingResult, map_database
 
 NUM = 10
 

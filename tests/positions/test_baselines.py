@@ -16,7 +16,7 @@ from colmap_vg.positions.cross import solve_cross
 from colmap_vg.positions.direct import solve_cle1
 from colmap_vg.positions.orthogonal import solve_orthogonal
 from colmap_vg.positions.shapefit import solve_shapefit
-from colmap_vg.synthetic import ring_scene
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 SOLVERS = {
     "bata": solve_bata,

@@ -7,7 +7,7 @@ from position_problems import ring_problem
 from colmap_vg import SolveOptions, align_positions, solve_view_graph
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.positions.lud import RESIDUAL_FLOOR, solve_lud
-from colmap_vg.synthetic import ring_scene
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 
 @pytest.mark.parametrize("weighted", [False, True])

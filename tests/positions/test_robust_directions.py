@@ -8,7 +8,7 @@ from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.positions.robust_directions import position_deviations, solve_robust_directions
-from colmap_vg.synthetic import nearest_neighbor_edges
+from colmap_vg.simulation.ring_scenes import nearest_neighbor_edges
 
 
 def scene(seed, num_images=30, neighbors=8):

@@ -13,7 +13,7 @@ from colmap_vg.geometry import so3
 from colmap_vg.rotations.certificate import certify_chordal
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.rotations.chordal_matrix import TangentQuadratic, chordal_cost, chordal_matrix
-from colmap_vg.synthetic import ring_scene
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 
 def _problem(num_images, seed, sigma=0.1, num_neighbors=4):

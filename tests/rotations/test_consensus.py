@@ -6,8 +6,8 @@ import pytest
 from colmap_vg.geometry import so3
 from colmap_vg.rotations.consensus import average_rotations_by_consensus, learned_log_odds
 from colmap_vg.rotations.robust import average_rotations_robust
-from colmap_vg.synthetic import ring_scene
-from colmap_vg.synthetic_objects import ObjectNoise, object_scene, symmetric_object_scene
+from colmap_vg.simulation.objects import ObjectNoise, object_scene, symmetric_object_scene
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 CLEAR_LEAD = 1.0 / 3.0
 

@@ -6,13 +6,12 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.errors import GraphError
-from colmap_vg.geometry import so3
-from colmap_vg.rotations import quaternions
+from colmap_vg.geometry import quaternions, so3
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.rotations.robust import average_rotations_robust
-from colmap_vg.synthetic import ring_scene
+from colmap_vg.scene.edge_residuals import rotation_residuals
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 
 def _errors(R, truth):

@@ -4,10 +4,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.geometry import so3
 from colmap_vg.rotations.spanning_tree import rotations_from_spanning_tree
-from colmap_vg.synthetic import ring_scene
+from colmap_vg.scene.edge_residuals import rotation_residuals
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 
 def _kruskal(num_images, edges, weights):

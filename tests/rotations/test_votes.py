@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_vg.edge_residuals import rotation_residuals
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.rotations.votes import AGREEMENT_DEG, rotations_by_votes
-from colmap_vg.synthetic import ring_scene
+from colmap_vg.scene.edge_residuals import rotation_residuals
+from colmap_vg.simulation.ring_scenes import ring_scene
 
 
 def _twin(num_images, edges, relative, weights):

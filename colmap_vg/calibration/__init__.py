@@ -1,0 +1,1 @@
+"""Focal lengths from matches alone."""

@@ -1,0 +1,148 @@
+"""Focal lengths of a whole database from its matches alone: pairs vote, and where they cannot, rotation cycles do."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.calibration.focal import FocalAgreement, focal_agreement
+from colmap_vg.calibration.focal_cycles import CycleVote, chosen_pairs, focal_fits_cycles, vote_focal_by_rotation_cycles
+from colmap_vg.errors import GraphError
+from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
+from colmap_vg.two_view.fundamental_covariance import fundamental_covariances
+from colmap_vg.two_view.segments import rows_of_segments
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+CYCLE_TOLERANCE = 0.08
+"""Relative difference from the cycles' vote that is not held against a given focal length: several of its errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibration:
+    """Focal lengths found from matches, and what they were found by.
+
+    Attributes
+    ----------
+    focal_lengths : (c,) array
+        Pixels: the given one where it is not contradicted; else the pairs' vote where it is reliable, else the cycles'.
+    found : (c,) bool array
+        The focal length is the matches', not the given one.
+    decided : (c,) bool array
+        A vote confirmed or replaced the focal length; elsewhere the matches do not know.
+    by_pairs : FocalAgreement
+    by_cycles : CycleVote or None
+        None where the pairs' vote sufficed, or given focal lengths close the cycles.
+    """
+
+    focal_lengths: Array
+    found: BoolArray
+    decided: BoolArray
+    by_pairs: FocalAgreement
+    by_cycles: CycleVote | None
+
+
+def estimate_focal_lengths(
+    edges: IntArray,
+    camera_idx: IntArray,
+    offsets: IntArray,
+    points1: Array,
+    points2: Array,
+    focal_lengths: Array,
+    principal_points: Array,
+    image_sizes: Array,
+    *,
+    given: BoolArray | None = None,
+    aspect_ratios: Array | None = None,
+    min_num_matches: int = 16,
+    max_effective_matches: float = 100.0,
+    num_iterations: int = 5,
+) -> SelfCalibration:
+    """Focal length of every camera from verified matches, whatever focal length they were verified under.
+
+    Fundamental matrices are refitted to the matches, so that neither a wrong focal length nor the sampling of a RANSAC
+    is left in them.
+
+    Parameters
+    ----------
+    edges : (m, 2) int array
+        Image rows of each pair.
+    camera_idx : (n,) int array
+        Camera row of each image.
+    offsets : (m + 1,) int array
+    points1, points2 : (k, 2) array
+        Matched keypoints in undistorted pixels.
+    focal_lengths : (c,) array
+        Pixels, given or guessed.
+    principal_points : (c, 2) array
+        Pixels.
+    image_sizes : (c,) or (c, 2) array
+        Pixels.
+    given : (c,) bool array, optional
+        Cameras whose focal length was given, by EXIF or the user: it falls only to a vote that contradicts it, a guess
+        to any reliable vote. Missing: none.
+    aspect_ratios : (c,) array, optional
+        Vertical over horizontal focal length; 1 where missing.
+    min_num_matches : int
+        Pairs with fewer are left out.
+    max_effective_matches : float
+        See `fundamental_covariances`; what the lens model leaves out does not average away.
+    num_iterations : int
+        Reweighting rounds of the refits.
+
+    Returns
+    -------
+    SelfCalibration
+
+    Raises
+    ------
+    GraphError
+        No pair has enough matches.
+    """
+    given = np.zeros(len(focal_lengths), dtype=bool) if given is None else given
+    used = np.flatnonzero(np.diff(offsets) >= max(min_num_matches, 8))
+    if not len(used):
+        raise GraphError(
+            f"no pair has the {min_num_matches} matches it takes to vote for a focal length: give the focal length"
+        )
+    rows, of_used = rows_of_segments(offsets, used)
+    p1, p2 = points1[rows], points2[rows]
+    F = estimate_fundamental_from_inliers(of_used, p1, p2, num_iterations=num_iterations)
+    known = fundamental_covariances(of_used, p1, p2, F, max_effective_matches=max_effective_matches)
+    votes = focal_agreement(
+        focal_lengths,
+        F,
+        camera_idx[edges[used]],
+        principal_points,
+        image_sizes,
+        covariances=known.covariances,
+        aspect_ratios=aspect_ratios,
+    )
+    by_pairs, reliable = votes.estimates, votes.estimates.reliable
+    found = np.where(given, votes.contradicted, reliable).astype(bool)
+    focal = np.where(found, by_pairs.focal_lengths, focal_lengths)
+    by_cycles, decided = None, reliable.copy()
+    # A camera without pairs is not decided by what other cameras' cycles say.
+    asked = ~reliable & (by_pairs.num_pairs > 0)
+    pairs = chosen_pairs(F, edges[used], camera_idx, of_used, p1, p2) if asked.any() else None
+    if pairs is not None:
+        aspect = np.ones(len(focal)) if aspect_ratios is None else aspect_ratios
+        guessed = asked & ~given
+        if guessed.any():
+            longer = image_sizes if image_sizes.ndim == 1 else image_sizes.max(axis=1)
+            by_cycles = vote_focal_by_rotation_cycles(
+                pairs, np.where(guessed, longer, focal), aspect, principal_points, guessed
+            )
+            takes = guessed & by_cycles.reliable
+        elif focal_fits_cycles(pairs, focal, aspect, principal_points, asked):
+            takes = np.zeros(len(focal), dtype=bool)
+        else:
+            by_cycles = vote_focal_by_rotation_cycles(pairs, focal, aspect, principal_points, asked)
+            takes = asked & (by_cycles.reliable and abs(np.log(by_cycles.factor)) > np.log1p(CYCLE_TOLERANCE))
+        if by_cycles is not None:
+            decided |= asked & by_cycles.reliable
+            focal = np.where(takes, by_cycles.focal_lengths, focal)
+        found |= takes
+    return SelfCalibration(focal, found, decided, votes, by_cycles)

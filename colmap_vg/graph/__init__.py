@@ -1,1 +1,0 @@
-"""Structure of viewing graphs: components, rigidity, cycles, outlier edges."""

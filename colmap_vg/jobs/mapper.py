@@ -1,0 +1,482 @@
+"""From a COLMAP database to models: read the viewing graph, solve it, build the model, write it whole or not at all."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.database import check_database
+from colmap_vg.colmap_io.loading import loaded_reconstruction
+from colmap_vg.colmap_io.quiet import quiet_colmap
+from colmap_vg.colmap_io.raw_matches import compared_pairs
+from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
+from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
+from colmap_vg.errors import MappingError
+from colmap_vg.events import StageEvent, StageLog
+from colmap_vg.geometry.similarity import align_positions
+from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
+from colmap_vg.mapping.build import (
+    MAX_NUM_ROUNDS,
+    SETTLED_COST,
+    BuildResult,
+    adjust_once_more,
+    build_model,
+)
+from colmap_vg.mapping.colors import extract_colors
+from colmap_vg.mapping.join import Joint, joined_poses, joint_of
+from colmap_vg.mapping.pair_agreement import PairRotations
+from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
+from colmap_vg.mapping.weak_cuts import WeakCut, cut_along, weak_cuts
+from colmap_vg.options import MappingOptions, SolveOptions
+from colmap_vg.reading.read import read_with_caveats
+from colmap_vg.scene.solution import PoseSolution
+from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict
+from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.solver.agreement import pair_agreement
+from colmap_vg.solver.solve import solve_view_graph
+from colmap_vg.solver.state import described
+
+SAME_LENS_COST = 0.8
+"""Share of its cost that bundle adjustment must leave when cameras that shared a calibration get their own: 0.98 to
+0.99 was left where there was one lens and images were strong, 0.89 where they were weak."""
+ROUGH_MATCHES = 100
+"""Of a pair, for solutions that points are to compare."""
+FALSE_PAIRS = (EdgeVerdict.EXCLUDED, EdgeVerdict.ROTATION_OUTLIER)
+"""Pairs whose matches are kept out of the points: a rotation that far off is not one of noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class MappingResult:
+    """What a mapping job found.
+
+    Attributes
+    ----------
+    models : dict of int to pycolmap.Reconstruction
+        As written, the largest first.
+    graph : ViewGraph
+    solution : PoseSolution
+        With the poses, focal factors and image verdicts of the finished model, in its frame; the rest as solved.
+    weak_cuts : tuple of tuples of WeakCut
+        Of each model: where few pairs hold it together, and what its points say of that.
+    """
+
+    models: dict[int, "pycolmap.Reconstruction"]
+    graph: ViewGraph
+    solution: PoseSolution
+    weak_cuts: tuple[tuple[WeakCut, ...], ...] = ()
+
+
+def view_graph_mapping(
+    database_path: str | PathLike[str],
+    image_path: str | PathLike[str] | None,
+    output_path: str | PathLike[str],
+    options: MappingOptions | None = None,
+    on_event: Callable[[StageEvent], None] | None = None,
+) -> dict[int, "pycolmap.Reconstruction"]:
+    """Make models from a database of verified matches, in place of ``pycolmap.global_mapping``.
+
+    Parameters
+    ----------
+    database_path : path
+        Never modified.
+    image_path : path or None
+        Folder of the photographs, for the colours of points; without it they stay black.
+    output_path : path
+        Models are written to ``output_path/0``, ``output_path/1``, ...; they appear whole or not at all.
+    options : MappingOptions, optional
+    on_event : callable, optional
+        Called with a `StageEvent` whenever a stage starts, gets on, ends, or has something to warn of.
+
+    Returns
+    -------
+    dict of int to pycolmap.Reconstruction
+        The models, the largest first.
+
+    Raises
+    ------
+    DatabaseError
+        The database is missing, damaged, or holds no verified pairs.
+    OutputError
+        The output cannot be written or already holds a model.
+    MappingError
+        No model could be made.
+    OptionError
+        The options are of another kind.
+    """
+    options = MappingOptions.given(options)
+    with quiet_colmap():
+        return map_database(database_path, image_path, output_path, options, StageLog(on_event)).models
+
+
+def map_database(
+    database_path: str | PathLike[str],
+    image_path: str | PathLike[str] | None,
+    output_path: str | PathLike[str],
+    options: MappingOptions,
+    log: StageLog,
+) -> MappingResult:
+    """As :func:`view_graph_mapping`, with the stages in the caller's log, the graph and the verdicts.
+
+    Parameters
+    ----------
+    database_path, image_path, output_path, options
+        As for :func:`view_graph_mapping`.
+    log : StageLog
+
+    Returns
+    -------
+    MappingResult
+
+    Raises
+    ------
+    ColmapVgError
+        As for :func:`view_graph_mapping`.
+    """
+    check_database(database_path)
+    refuse_models(output_path, options.overwrite)
+    with work_folder(output_path, options.overwrite) as work:
+        graph = _read(database_path, options, log)
+        solution = _solve(graph, options, log)
+        if not solution.registered.any():
+            raise MappingError(f"{database_path}: {solution.message}")
+        if solution.arrangements and graph.has_inliers and options.solve.method == "epipolar":
+            solution = _second_opinion(database_path, work, graph, solution, options, log)
+        built = _build(database_path, work, graph, solution, options, log)
+        if not built:
+            raise MappingError(
+                f"{database_path}: {int((solution.component >= 0).sum())} poses were solved, but no three images share"
+                " points at an angle that could fix them; add overlapping photographs, taken from different places"
+            )
+        cuts = _weak_cuts(database_path, graph, built, log)
+        with log.stage("write"):
+            staged = stage_models(work, len(built))
+            for folder, model in zip(staged, built, strict=True):
+                model.reconstruction.normalize()
+                if options.extract_colors:
+                    extract_colors(model.reconstruction, image_path, log)
+                write_model(model.reconstruction, folder)
+            published = publish_models(staged, output_path)
+            log.result(", ".join(map(str, published)))
+    models = {index: model.reconstruction for index, model in enumerate(built)}
+    return MappingResult(models, graph, _as_in_models(solution, graph, built, cuts), cuts)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A finished model, and what changed on the way."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    result: BuildResult
+
+
+def _build(
+    database_path: str | PathLike[str],
+    work: Path,
+    graph: ViewGraph,
+    solution: PoseSolution,
+    options: MappingOptions,
+    log: StageLog,
+) -> list[_Model]:
+    """Models of all components that the points support, the one with most images first."""
+    refined = options.ba_refine_focal_length or options.ba_refine_principal_point or options.ba_refine_extra_params
+    shared = shared_cameras(graph) if options.share_cameras and refined else []
+    without = _false_pairs(graph, solution)
+    with log.stage("load"):
+        with loaded_cache(database_path, work, options.read.min_num_inliers, shared, without, graph) as (
+            cache,
+            replaced,
+        ):
+            components = range(int(solution.component.max(initial=-1)) + 1)
+            posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
+        if replaced:
+            log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
+    models: list[_Model] = []
+    pairs = _pair_rotations(graph)
+    for component, reconstruction in enumerate(posed):
+        others = frozenset(solution.image_ids[~np.isin(solution.component, (-1, component))].tolist())
+        result = build_model(cache, reconstruction, options, log, others, pairs)
+        if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() > 0:
+            models.append(_Model(reconstruction, result))
+        elif len(posed) > 1:
+            count = int((solution.component == component).sum())
+            log.warn(f"{count} images that seemed a model of their own share no points that could fix them.")
+    if len(models) > 1:
+        models = _joined(cache, models, graph, pairs, compared_pairs(database_path), options, log)
+    if models and replaced:
+        with (
+            log.stage("cameras"),
+            loaded_cache(database_path, work, options.read.min_num_inliers, (), without, graph) as (cache, _),
+        ):
+            models = [
+                replace(m, reconstruction=_on_own_cameras(cache, m.reconstruction, replaced, options, log))
+                for m in models
+            ]
+    return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
+
+
+def _joined(
+    cache: "pycolmap.DatabaseCache",
+    models: list[_Model],
+    graph: ViewGraph,
+    pairs: PairRotations,
+    compared: NDArray[np.int64],
+    options: MappingOptions,
+    log: StageLog,
+) -> list[_Model]:
+    """The models, those put together that share points which agree on how they lie to each other."""
+    refused: set[frozenset[int]] = set()
+    while True:
+        with log.stage("join"):
+            models = sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
+            first, second, joint = _best_joint(models, graph, refused, options.random_seed)
+            if joint.similarity is None:
+                log.result("one model" if len(models) == 1 else f"{len(models)} models, no two of which share points")
+                return models
+            own, other = models[first].reconstruction, models[second].reconstruction
+            log.result(
+                f"models of {own.num_reg_images()} and {other.num_reg_images()} images share {joint.num_shared} points,"
+                f" {joint.num_agreeing} of which agree on how the two lie to each other"
+            )
+        posed = joined_poses(loaded_reconstruction(cache), own, other, joint.similarity)
+        both, moved = set(posed.reg_image_ids()), set(other.reg_image_ids())
+        elsewhere = frozenset(
+            i for k, m in enumerate(models) if k not in (first, second) for i in m.reconstruction.reg_image_ids()
+        )
+        result = build_model(cache, posed, options, log, elsewhere, pairs)
+        cut = cut_along(posed, pairs, compared, moved)
+        if both <= set(posed.reg_image_ids()) and not result.folded and not cut.contradicted:
+            rest = [model for k, model in enumerate(models) if k not in (first, second)]
+            models = [*rest, _Model(posed, result)]
+            continue
+        refused.add(frozenset(own.reg_image_ids()) | frozenset(moved))
+        log.warn(
+            f"Models of {own.num_reg_images()} and {len(moved)} images share points, but are not joined: adjusted"
+            f" together they lose {len(both - set(posed.reg_image_ids()))} images, and of what both should see"
+            f" {cut.share_seen:.2f} is seen by both ({cut.share_seen_elsewhere:.2f} elsewhere)."
+        )
+
+
+def _best_joint(
+    models: Sequence[_Model], graph: ViewGraph, refused: set[frozenset[int]], seed: int
+) -> tuple[int, int, Joint]:
+    """The two models that most shared points join; a joint without a similarity where there are none."""
+    best = 0, 0, Joint(0, 0, None)
+    for a, one in enumerate(models):
+        for b in range(a + 1, len(models)):
+            own, other = one.reconstruction, models[b].reconstruction
+            if frozenset(own.reg_image_ids()) | frozenset(other.reg_image_ids()) in refused:
+                continue
+            joint = joint_of(own, other, graph, seed)
+            if joint.similarity is not None and joint.num_agreeing > best[2].num_agreeing:
+                best = a, b, joint
+    return best
+
+
+def _second_opinion(
+    database_path: str | PathLike[str],
+    work: Path,
+    graph: ViewGraph,
+    solution: PoseSolution,
+    options: MappingOptions,
+    log: StageLog,
+) -> PoseSolution:
+    """Of a solution and other arrangements of its images, the one in whose images most is seen of what should be."""
+    with log.stage("second opinion"):
+        # All of them roughly, so that none is judged better because more was done for it.
+        rough = replace(_solve_options(options), refine_focal_lengths="never", max_matches_per_edge=ROUGH_MATCHES)
+        found = [
+            _point_evidence(database_path, work, graph, solve_view_graph(graph, rough, rotations), options)
+            for rotations in solution.arrangements
+        ]
+        shown = ", ".join(f"{evidence.share_seen:.2f}" for evidence in found)
+        log.result(f"of the points that images should see, so large a share is seen in each arrangement: {shown}")
+        best, settled = best_arrangement(found)
+        chosen, in_doubt = solution, None if settled else solution.in_doubt
+        if best > 0:
+            chosen = solve_view_graph(graph, _solve_options(options), solution.arrangements[best])
+            for caveat in chosen.caveats:
+                log.warn(caveat)
+            log.warn(
+                "Pairs agree with another arrangement of the images more, but there images do not see what they should:"
+                f" {found[best].share_seen:.2f} of it is seen in the arrangement that is used,"
+                f" {found[0].share_seen:.2f} in the other."
+            )
+        elif settled and solution.in_doubt is not None:
+            log.warn(
+                "The points settle between them: this arrangement's images see"
+                f" {found[0].share_seen:.2f} of what they should."
+            )
+        status, message = described(chosen.image_verdicts, chosen.converged, chosen.agreement, in_doubt is not None)
+        return replace(chosen, in_doubt=in_doubt, status=status, message=message)
+
+
+def _point_evidence(
+    database_path: str | PathLike[str], work: Path, graph: ViewGraph, solution: PoseSolution, options: MappingOptions
+) -> PointEvidence:
+    with loaded_cache(database_path, work, options.read.min_num_inliers, (), _false_pairs(graph, solution), graph) as (
+        cache,
+        _,
+    ):
+        return point_evidence(cache, reconstruction_from_solution(cache, solution, graph, 0), options)
+
+
+def _false_pairs(graph: ViewGraph, solution: PoseSolution) -> list[tuple[int, int]]:
+    """Image ids of pairs whose matches are kept out of the points."""
+    false = np.isin(solution.edge_verdicts, FALSE_PAIRS)
+    return [(int(a), int(b)) for a, b in graph.image_ids[graph.edges[false]]]
+
+
+def _pair_rotations(graph: ViewGraph) -> PairRotations:
+    """Of pairs whose matches have a rotation of their own, whatever the solver thought of it."""
+    posed = graph.has_rotation
+    matches = np.ones(graph.num_edges) if graph.num_inliers is None else graph.num_inliers.astype(np.float64)
+    return PairRotations(graph.image_ids[graph.edges[posed]], graph.cam2_from_cam1_rotations[posed], matches[posed])
+
+
+def _read(database_path: str | PathLike[str], options: MappingOptions, log: StageLog) -> ViewGraph:
+    with log.stage("view graph"):
+        read = replace(options.read, num_threads=options.num_threads, random_seed=options.random_seed)
+        if not options.ba_refine_focal_length:
+            # Who keeps bundle adjustment from focal lengths wants them as they are.
+            read = replace(read, trust_focal_lengths="always")
+        if not options.ba_refine_extra_params:
+            read = replace(read, find_distortion=False)
+        graph, caveats = read_with_caveats(database_path, read)
+        for caveat in caveats:
+            log.warn(caveat)
+        log.result(f"{graph.num_images} images, {graph.num_edges} pairs, {int(graph.has_rotation.sum())} usable")
+    return graph
+
+
+def _solve(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:
+    with log.stage("solve"):
+        solution = solve_view_graph(graph, _solve_options(options))
+        for caveat in solution.caveats:
+            log.warn(caveat)
+        log.result(solution.message)
+    return solution
+
+
+def _solve_options(options: MappingOptions) -> SolveOptions:
+    solve = replace(options.solve, random_seed=options.random_seed)
+    return solve if options.ba_refine_focal_length else replace(solve, refine_focal_lengths="never")
+
+
+def _on_own_cameras(
+    cache: "pycolmap.DatabaseCache",
+    shared: "pycolmap.Reconstruction",
+    replaced: dict[int, int],
+    options: MappingOptions,
+    log: StageLog,
+) -> "pycolmap.Reconstruction":
+    """The model on the database's own cameras, with the shared calibrations unless these cost too much."""
+    trial = with_own_cameras(cache, shared, replaced)
+    left = adjust_once_more(cache, trial, options)
+    if left < SAME_LENS_COST:
+        for _ in range(MAX_NUM_ROUNDS):
+            if adjust_once_more(cache, trial, options) > SETTLED_COST:
+                break
+        log.result(f"the photographs show different lenses: calibrated one by one, the cost falls by {1.0 - left:.0%}")
+        return trial
+    log.result(f"one lens: calibrated one by one, the cost would fall by {1.0 - left:.1%} only")
+    model = with_own_cameras(cache, shared, replaced)
+    model.tear_down()  # of the cameras, rigs and images of other models
+    return model
+
+
+def _weak_cuts(
+    database_path: str | PathLike[str], graph: ViewGraph, models: Sequence[_Model], log: StageLog
+) -> tuple[tuple[WeakCut, ...], ...]:
+    """Of each model, where few pairs hold it together; with a warning where its points speak against them."""
+    with log.stage("check"):
+        compared, pairs = compared_pairs(database_path), _pair_rotations(graph)
+        found = tuple(weak_cuts(model.reconstruction, pairs, compared) for model in models)
+        for model, cuts in zip(models, found, strict=True):
+            for cut in cuts:
+                if cut.contradicted:
+                    names = sorted(model.reconstruction.image(i).name for i in cut.images)
+                    log.warn(
+                        f"{len(names)} images ({names[0]} to {names[-1]}) are held to the rest of the model by"
+                        f" {cut.num_pairs} of their pairs, but of what both sides should see only {cut.share_seen:.2f}"
+                        f" is seen by both ({cut.share_seen_elsewhere:.2f} elsewhere). They may show another place"
+                        " that looks alike."
+                    )
+        log.result(f"{sum(map(len, found))} places where few pairs hold a model together")
+    return found
+
+
+def _as_in_models(
+    solution: PoseSolution, graph: ViewGraph, models: Sequence[_Model], cuts: Sequence[Sequence[WeakCut]]
+) -> PoseSolution:
+    """The solution with the poses, focal lengths and image verdicts of the finished models."""
+    words = solution.image_verdicts.astype(object)
+    words[solution.component >= 0] = ImageVerdict.FEW_OBSERVATIONS
+    misplaced = sorted(set().union(*(model.result.misplaced for model in models)))
+    words[np.isin(solution.image_ids, misplaced)] = ImageVerdict.MISPLACED
+    component = np.full(len(words), -1)
+    rotations = np.full_like(solution.cam_from_world_rotations, np.nan)
+    centers = np.full_like(solution.projection_centers, np.nan)
+    focal_scales = solution.focal_scales.copy()
+    for index in reversed(range(len(models))):
+        model = models[index].reconstruction
+        for row in np.flatnonzero(np.isin(solution.image_ids, sorted(model.reg_image_ids()))):
+            image = model.image(int(solution.image_ids[row]))
+            component[row] = index
+            words[row] = ImageVerdict.REGISTERED if index == 0 else ImageVerdict.OTHER_MODEL
+            rotations[row] = image.cam_from_world().rotation.matrix()
+            centers[row] = image.projection_center()
+        focal_scales = _focal_scales(focal_scales, graph, model)
+    agreement = pair_agreement(graph, rotations, centers, component)
+    contradicted = sorted(set().union(*(cut.images for of_model in cuts for cut in of_model if cut.contradicted)))
+    in_doubt = solution.in_doubt
+    if contradicted:
+        in_doubt = (False if in_doubt is None else in_doubt) | np.isin(solution.image_ids, contradicted)
+    doubtful = in_doubt is not None or any(model.result.folded for model in models)
+    status, message = described(words, solution.converged, agreement, doubtful)
+    return replace(
+        solution,
+        position_covariances=_covariances_in_models(solution, centers, component),
+        cam_from_world_rotations=rotations,
+        projection_centers=centers,
+        registered=component == 0,
+        component=component,
+        focal_scales=focal_scales,
+        image_verdicts=words.astype(str),
+        status=status,
+        message=message,
+        agreement=agreement,
+        in_doubt=in_doubt,
+    )
+
+
+def _covariances_in_models(
+    solution: PoseSolution, centers: NDArray[np.float64], component: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
+    """Covariances of positions, turned and scaled into the frames of the models; NaN for images that came later."""
+    if solution.position_covariances is None:
+        return None
+    covariances = np.full_like(solution.position_covariances, np.nan)
+    for model in range(int(component.max(initial=-1)) + 1):
+        rows = np.flatnonzero((component == model) & np.isfinite(solution.projection_centers).all(axis=1))
+        if len(rows) >= 3:
+            _, similarity = align_positions(solution.projection_centers[rows], centers[rows])
+            turned = similarity.rotation @ solution.position_covariances[rows] @ similarity.rotation.T
+            covariances[rows] = similarity.scale**2 * turned
+    return covariances
+
+
+def _focal_scales(
+    scales: NDArray[np.float64], graph: ViewGraph, model: "pycolmap.Reconstruction"
+) -> NDArray[np.float64]:
+    """Factors from the graph's focal lengths to the model's; cameras that are not in the model keep theirs."""
+    scales = scales.copy()
+    if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
+        used = {model.image(i).camera_id for i in model.reg_image_ids()}
+        for row, camera_id in enumerate(graph.camera_ids.tolist()):
+            if camera_id in used:
+                scales[row] = model.camera(camera_id).mean_focal_length() / graph.camera_focal_lengths[row]
+    return scales

@@ -1,0 +1,118 @@
+"""``summary.json``: what a job was asked, what it did, how long it took, and what it left out and why."""
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_vg._version import __version__
+from colmap_vg.errors import OutputError
+from colmap_vg.events import StageRecord
+
+if TYPE_CHECKING:
+    import pycolmap
+
+FILE_NAME = "summary.json"
+
+
+def job_summary(
+    verb: str, options: Mapping[str, object], records: Sequence[StageRecord], warnings: Sequence[str]
+) -> dict[str, object]:
+    """The part of the summary that every verb shares: verb, version, options, stages and warnings."""
+    return {
+        "verb": verb,
+        "version": __version__,
+        "options": {name: plain(value) for name, value in options.items()},
+        "stages": [asdict(record) for record in records],
+        "seconds": sum(record.seconds for record in records),
+        "peak_memory_mib": max((record.peak_memory_mib for record in records), default=0.0),
+        "warnings": list(warnings),
+    }
+
+
+def image_summary(names: Iterable[str], verdicts: Iterable[str], registered: Iterable[bool]) -> dict[str, object]:
+    """Images registered, and those left out with the verdict of each."""
+    rows = list(zip(names, verdicts, registered, strict=True))
+    left_out = {name: str(verdict) for name, verdict, is_registered in rows if not is_registered}
+    return {
+        "num_images": len(rows),
+        "num_registered": len(rows) - len(left_out),
+        "registered": sorted(name for name, _, is_registered in rows if is_registered),
+        "left_out": left_out,
+    }
+
+
+def edge_summary(verdicts: Iterable[str], kept: Iterable[bool]) -> dict[str, object]:
+    """Number of edges kept, and of those dropped by reason."""
+    rows = list(zip(verdicts, kept, strict=True))
+    dropped = Counter(str(verdict) for verdict, is_kept in rows if not is_kept)
+    return {
+        "num_edges": len(rows),
+        "num_kept": len(rows) - dropped.total(),
+        "dropped": dict(dropped.most_common()),
+    }
+
+
+def model_summary(path: Path, model: "pycolmap.Reconstruction") -> dict[str, object]:
+    """Size and fit of a model."""
+    model.update_point_3d_errors()  # the mean below reads stored errors
+    return {
+        "path": str(path),
+        "num_images": model.num_reg_images(),
+        "num_points": model.num_points3D(),
+        "num_observations": model.compute_num_observations(),
+        "mean_track_length": model.compute_mean_track_length(),
+        "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
+    }
+
+
+def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
+    """Write ``summary.json``, whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    temporary = output_path / f".{FILE_NAME}.{os.getpid()}"
+    try:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.replace(output_path / FILE_NAME)
+    except OSError as error:
+        raise OutputError(f"cannot write {output_path / FILE_NAME}: {error.strerror}") from error
+
+
+def told_bridges(output_path: Path) -> list[str]:
+    """What the summary of a finished job says of the links between and within its models.
+
+    Raises
+    ------
+    OutputError
+        There is no summary, or it is damaged.
+    """
+    path = output_path / FILE_NAME
+    try:
+        return [str(bridge["told"]) for bridge in json.loads(path.read_text(encoding="utf-8"))["bridges"]]
+    except OSError as error:
+        raise OutputError(f"cannot read {path}: {error.strerror}; run the job again") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise OutputError(f"{path} is damaged, or of another version: run the job again") from error
+
+
+def plain(value: object) -> object:
+    """The value in JSON's types."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {name: plain(item) for name, item in asdict(value).items()}
+    if isinstance(value, Mapping):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, Enum):
+        return plain(value.value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return os.fspath(value) if isinstance(value, os.PathLike) else str(value)

@@ -1,1 +1,0 @@
-"""Rotations and positions together: pose-graph optimisation and Algorithm 2."""

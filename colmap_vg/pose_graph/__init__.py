@@ -1,0 +1,1 @@
+"""Rotations and positions together, from relative poses."""

@@ -1,0 +1,188 @@
+"""Whether the focal lengths of a database can be trusted, and those to use where they cannot.
+
+The database's own words do not tell: with a prior, COLMAP verifies pairs by essential matrices and calls them
+CALIBRATED under a focal length 15 % off; without one, nearly every pair is UNCALIBRATED, and so are false pairs under a
+right focal length. The matches tell: each pair's fundamental matrix votes for the focals that make it essential.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.calibration.self_calibration import SelfCalibration, estimate_focal_lengths
+from colmap_vg.colmap_io.tables import CALIBRATED, PANORAMIC, PLANAR, PLANAR_OR_PANORAMIC, UNCALIBRATED, DatabaseTables
+from colmap_vg.colmap_io.undistortion import undistorted_keypoints
+from colmap_vg.options import ReadOptions
+from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_subset
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+ALIKE = 0.03
+"""Relative difference below which two votes are taken for one lens; lenses differ by more, or it does not matter."""
+MAX_PAIRS_PER_CAMERA = 400
+"""Pairs that vote for a camera, those of most matches."""
+MIN_MATCHES_PER_VOTE = 16
+MAX_MATCHES_PER_VOTE = 300
+"""Matches of a pair that its vote uses, evenly over its list; more change the vote by less than its own error."""
+
+
+@dataclass(frozen=True, eq=False)
+class FocalDecision:
+    """Focal lengths to read a database with.
+
+    Attributes
+    ----------
+    scales : (c,) array
+        Factor on each camera's focal length in the database.
+    known : (c,) bool array
+        The focal length was given and is not contradicted.
+    caveats : tuple of str
+        What was changed or could not be decided, one sentence each.
+    """
+
+    scales: Array
+    known: BoolArray
+    caveats: tuple[str, ...]
+
+
+def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalDecision:
+    """Decide for each camera whether its focal length is kept, and by what factor it changes where not."""
+    prior = np.array([c.has_prior_focal_length for c in tables.cameras], dtype=bool)
+    as_given = np.ones(len(prior))
+    if options.trust_focal_lengths == "always":
+        return FocalDecision(as_given, np.ones(len(prior), dtype=bool), _contradictions(tables, options))
+    return _voted(tables, prior, options)
+
+
+def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, ...]:
+    """Sentences on focal lengths that are kept, although image pairs tell others."""
+    focals = np.array([c.focal_length_x for c in tables.cameras])
+    calibration = _self_calibration(tables, focals, np.ones(len(focals), dtype=bool), options)
+    if calibration is None:
+        return ()
+    votes = calibration.by_pairs.estimates
+    against = np.flatnonzero(calibration.by_pairs.contradicted)
+    if len(against) == 0:
+        return ()
+    first = against[0]
+    others = f" So it is with {len(against) - 1} more cameras." if len(against) > 1 else ""
+    return (
+        f"Camera {tables.cameras[first].camera_id}: {votes.support[first]} of {votes.num_pairs[first]} image pairs tell"
+        f" a focal length of {votes.focal_lengths[first]:.1f} px, not the {focals[first]:.1f} px of the database, which"
+        f" is kept as asked.{others}",
+    )
+
+
+def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> FocalDecision:
+    focals = np.array([c.focal_length_x for c in tables.cameras])
+    given = prior & (options.trust_focal_lengths != "never")
+    calibration = _self_calibration(tables, focals, given, options)
+    if calibration is None:
+        return FocalDecision(np.ones(len(focals)), prior, (_why_unchecked(tables, options),))
+    found = calibration.focal_lengths
+    without = ~given & ~calibration.decided
+    found = np.where(given, found, _in_common(tables, found, calibration, given))
+    scales = found / focals
+    caveats = [
+        f"Camera {c.camera_id}: the focal length {f:.1f} px of the database is contradicted by its image pairs;"
+        f" {s * f:.1f} px is used instead."
+        for c, f, s, bad in zip(tables.cameras, focals, scales, calibration.found & prior, strict=True)
+        if bad
+    ]
+    if without.any():
+        source = "they take that of the other cameras" if calibration.decided.any() else "COLMAP's guess is used"
+        caveats.append(
+            f"{int(without.sum())} of {len(focals)} cameras have no focal length, and their pairs do not tell it;"
+            f" {source}."
+        )
+    return FocalDecision(np.asarray(scales, dtype=float), given & ~calibration.found, tuple(caveats))
+
+
+def _why_unchecked(tables: DatabaseTables, options: ReadOptions) -> str:
+    """The caveat of a database in which no pair can vote."""
+    enough = np.diff(tables.offsets) >= max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)
+    flat = np.isin(tables.configs, (PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC))
+    if (enough & flat).any():
+        why = f"in {int((enough & flat).sum())} pairs all matches are on one plane, or the camera turned on the spot"
+    elif enough.any():
+        why = "COLMAP found no geometry for the pairs that have enough matches"
+    else:
+        why = f"no pair has the {max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)} matches that it takes"
+    return f"The focal lengths cannot be checked, and are taken as they are in the database: {why}."
+
+
+def _in_common(tables: DatabaseTables, found: Array, calibration: SelfCalibration, given: BoolArray) -> Array:
+    """Focal lengths, equal among alike cameras without a given one unless their own pairs contradict it.
+
+    Most such folders were taken with one lens. Cameras that could not vote take what the others of the folder have.
+    """
+    decided, sigmas = calibration.decided & ~given, calibration.by_pairs.estimates.sigmas
+    size = np.array([max(c.width, c.height) for c in tables.cameras], dtype=float)
+    anywhere = np.log(np.median((found / size)[calibration.decided])) if calibration.decided.any() else None
+    kinds: dict[object, list[int]] = {}
+    for row in np.flatnonzero(~given):
+        camera = tables.cameras[row]
+        kinds.setdefault((camera.model_name, camera.width, camera.height), []).append(int(row))
+    result = found.copy()
+    for members in kinds.values():
+        rows = np.array(members)
+        voters = rows[decided[rows]]
+        if len(voters) == 0:
+            if anywhere is not None:
+                result[rows] = np.exp(anywhere) * size[rows]
+            continue
+        log_ratio = np.log(found[voters] / size[voters])
+        common = float(np.median(log_ratio))
+        agree = np.abs(log_ratio - common) <= np.maximum(3.0 * np.nan_to_num(sigmas[voters], posinf=0.0), ALIKE)
+        if agree.mean() < 0.5:
+            continue
+        weights = 1.0 / np.square(np.clip(np.nan_to_num(sigmas[voters[agree]], posinf=1.0), 1e-3, 1.0))
+        common = float(np.average(log_ratio[agree], weights=weights))
+        joined = np.concatenate([voters[agree], rows[~decided[rows]]])
+        result[joined] = np.exp(common) * size[joined]
+    return result
+
+
+def _self_calibration(
+    tables: DatabaseTables, focals: Array, given: BoolArray, options: ReadOptions
+) -> SelfCalibration | None:
+    enough = np.diff(tables.offsets) >= max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)
+    chosen = np.flatnonzero(np.isin(tables.configs, (CALIBRATED, UNCALIBRATED)) & enough)
+    if len(chosen) == 0:
+        return None
+    chosen = chosen[_strongest_of_cameras(tables.camera_idx[tables.pairs[chosen]], np.diff(tables.offsets)[chosen])]
+    rows, offsets = rows_of_segments(tables.offsets, chosen)
+    thin = evenly_thinned(offsets, MAX_MATCHES_PER_VOTE)
+    rows, offsets = rows[thin], segment_subset(offsets, thin)
+    pixels, valid = undistorted_keypoints(tables)
+    first, second = (tables.matched_keypoints(rows, chosen, offsets, side) for side in (0, 1))
+    seen = valid[first] & valid[second]
+    points1, points2, offsets = pixels[first[seen]], pixels[second[seen]], segment_subset(offsets, seen)
+    if np.diff(offsets).max(initial=0) < MIN_MATCHES_PER_VOTE:
+        return None
+    return estimate_focal_lengths(
+        tables.pairs[chosen],
+        tables.camera_idx,
+        offsets,
+        points1,
+        points2,
+        focals,
+        np.array([[c.principal_point_x, c.principal_point_y] for c in tables.cameras]),
+        np.array([[c.width, c.height] for c in tables.cameras], dtype=float),
+        given=given,
+        aspect_ratios=np.array([c.focal_length_y / c.focal_length_x for c in tables.cameras]),
+    )
+
+
+def _strongest_of_cameras(cameras: IntArray, num_matches: IntArray) -> BoolArray:
+    """Pairs (m,) that are among the strongest of one of their cameras (m, 2)."""
+    pair = np.tile(np.arange(len(cameras)), 2)
+    camera = cameras.T.ravel()
+    order = np.lexsort((pair, -num_matches[pair], camera))
+    rank = np.arange(len(order)) - np.searchsorted(camera[order], camera[order], side="left")
+    kept = np.zeros(len(cameras), dtype=bool)
+    kept[pair[order[rank < MAX_PAIRS_PER_CAMERA]]] = True
+    return kept

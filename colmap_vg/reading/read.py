@@ -1,0 +1,126 @@
+"""From a COLMAP database to a viewing graph: every image, every verified pair, each with a verdict."""
+
+from os import PathLike
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.cameras import bearings_of_keypoints, has_radial_term, with_focal_scale
+from colmap_vg.colmap_io.pair_lists import listed_edges
+from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
+from colmap_vg.linear.threads import single_threaded_blas
+from colmap_vg.options import ReadOptions
+from colmap_vg.reading.distortion import with_found_distortion
+from colmap_vg.reading.focals import FocalDecision, decide_focal_lengths
+from colmap_vg.reading.relative_poses import relative_poses
+from colmap_vg.reading.still_background import without_still_background
+from colmap_vg.reading.verification import with_own_geometries
+from colmap_vg.scene.verdicts import EdgeVerdict
+from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.two_view.segments import evenly_thinned, segment_subset
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | None = None) -> ViewGraph:
+    """Viewing graph of a COLMAP database, which is never modified.
+
+    Parameters
+    ----------
+    database_path : path
+        A database with keypoints and verified matches, by COLMAP of any version or by another matcher.
+    options : ReadOptions, optional
+
+    Returns
+    -------
+    ViewGraph
+        All images, and all pairs with verified matches; `read_verdicts` says which pairs may be used. Focal lengths
+        that the pairs contradict, or that are only COLMAP's guess, are replaced by those found from the pairs
+        (`camera_focal_lengths`, `camera_focal_known`).
+
+    Raises
+    ------
+    DatabaseError
+        The file cannot be read or is damaged.
+    """
+    graph, _ = read_with_caveats(database_path, ReadOptions.given(options))
+    return graph
+
+
+@single_threaded_blas
+def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) -> tuple[ViewGraph, tuple[str, ...]]:
+    """The viewing graph, and what was changed or could not be decided on reading, one sentence each."""
+    tables = read_tables(database_path)
+    terms = np.zeros(len(tables.cameras))
+    if options.find_distortion:
+        tables, terms = with_found_distortion(tables, database_path)
+    tables, thinned = without_still_background(tables, database_path)
+    expected = thinned | (terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1)
+    tables, changed = with_own_geometries(tables, options.random_seed, expected)
+    changed |= thinned
+    focals = decide_focal_lengths(tables, options)
+    return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
+
+
+def _graph(
+    tables: DatabaseTables, focals: FocalDecision, changed: BoolArray, terms: Array, options: ReadOptions
+) -> ViewGraph:
+    cameras = [with_focal_scale(c, s) for c, s in zip(tables.cameras, focals.scales, strict=True)]
+    offsets, matches, bearings1, bearings2 = _rays_of_matches(tables, cameras)
+    geometry = relative_poses(
+        tables, focals.scales, focals.known, offsets, bearings1, bearings2, options.min_num_inliers
+    )
+    num_inliers = np.diff(offsets)
+    excluded = listed_edges(options.excluded_pairs_path, tables.image_names, tables.pairs)
+    trusted = listed_edges(options.trusted_pairs_path, tables.image_names, tables.pairs) & ~excluded
+    # A trusted pair needs no confirmation of its fundamental matrix.
+    doubted = trusted & (geometry.verdicts == EdgeVerdict.UNCALIBRATED)
+    verdicts = np.where(excluded, str(EdgeVerdict.EXCLUDED), geometry.verdicts)
+    verdicts = np.where(doubted, str(EdgeVerdict.KEPT), verdicts)
+    thin = evenly_thinned(offsets, options.max_num_inliers_per_edge)
+    return ViewGraph(
+        image_ids=tables.image_ids,
+        edges=tables.pairs,
+        cam2_from_cam1_rotations=geometry.rotations,
+        cam2_in_cam1_directions=geometry.directions,
+        num_inliers=num_inliers,
+        camera_idx=tables.camera_idx,
+        image_names=tables.image_names,
+        camera_ids=np.array([c.camera_id for c in cameras], dtype=np.int64),
+        camera_focal_lengths=np.array([c.mean_focal_length() for c in cameras]),
+        camera_focal_known=focals.known,
+        camera_radial=np.array([has_radial_term(c) for c in cameras], dtype=bool),
+        read_verdicts=verdicts,
+        trusted=trusted if trusted.any() else None,
+        found_radial_terms=terms if terms.any() else None,
+        verified_anew=changed if changed.any() else None,
+        planar=geometry.planar,
+        triangulation_angles=geometry.angles,
+        edge_information=geometry.information,
+        inlier_offsets=segment_subset(offsets, thin),
+        inlier_bearings1=bearings1[thin],
+        inlier_bearings2=bearings2[thin],
+        inlier_keypoints1=matches[thin, 0].astype(np.int32),
+        inlier_keypoints2=matches[thin, 1].astype(np.int32),
+    )
+
+
+def _rays_of_matches(
+    tables: DatabaseTables, cameras: list["pycolmap.Camera"]
+) -> tuple[IntArray, IntArray, Array, Array]:
+    """Offsets, keypoint indices and unit rays of the matches that have rays in both images."""
+    starts = np.concatenate([[0], np.cumsum([len(k) for k in tables.keypoints])]).astype(np.int64)
+    rays, valid = np.zeros((int(starts[-1]), 3)), np.zeros(int(starts[-1]), dtype=bool)
+    for camera_row, camera in enumerate(cameras):
+        images = np.flatnonzero(tables.camera_idx == camera_row)
+        points = np.concatenate([np.zeros((0, 2))] + [tables.keypoints[i] for i in images])
+        found, good = bearings_of_keypoints(camera, points)
+        rows = np.concatenate([np.zeros(0, dtype=np.int64)] + [np.arange(starts[i], starts[i + 1]) for i in images])
+        rays[rows], valid[rows] = found, good
+    image = np.repeat(tables.pairs, np.diff(tables.offsets), axis=0)
+    rows = starts[image] + tables.matches
+    keep = np.asarray(valid[rows].all(axis=1))
+    return segment_subset(tables.offsets, keep), tables.matches[keep], rays[rows[keep, 0]], rays[rows[keep, 1]]

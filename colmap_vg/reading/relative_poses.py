@@ -1,0 +1,293 @@
+"""Trustworthy relative poses of a database's pairs, each by what COLMAP found it to be, and refined on its inliers.
+
+Stored poses are candidates like others: they are used where the inliers fit them best. Seen on real databases: poses
+that are identity and zero with E filled in, homographies whose stored pose is 85 degrees off.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.cameras import calibration_matrix
+from colmap_vg.colmap_io.tables import (
+    DEGENERATE,
+    PANORAMIC,
+    PLANAR,
+    PLANAR_OR_PANORAMIC,
+    UNCALIBRATED,
+    WATERMARK,
+    DatabaseTables,
+)
+from colmap_vg.geometry.directions import normalized
+from colmap_vg.scene.verdicts import EdgeVerdict
+from colmap_vg.two_view.edge_information import refine_relative_poses
+from colmap_vg.two_view.eight_point import estimate_essential_from_inliers
+from colmap_vg.two_view.essential import (
+    RelativePoses,
+    essential_from_fundamental,
+    essential_from_pose,
+    judged_poses,
+    poses_from_essential,
+)
+from colmap_vg.two_view.homography import calibrated_homography, poses_from_homography, pure_rotations
+from colmap_vg.two_view.sampson import Matches, residuals
+from colmap_vg.two_view.segments import (
+    evenly_thinned,
+    rows_of_segments,
+    segment_of_rows,
+    segment_quantiles,
+    segment_subset,
+    segment_sums,
+)
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+MIN_SHARE_IN_FRONT = 0.5
+"""Below this share of matches in front of both cameras a pose is a guess."""
+MAX_MEDIAN_ERROR_PX = 4.0
+"""COLMAP's own two-view threshold; a pose whose median match is beyond it explains nothing."""
+MIN_ANGLE = np.radians(0.2)
+"""Median triangulation angle below which the direction of a pair says nothing."""
+MAX_SPURIOUS_ANGLE = np.radians(3.0)
+"""Median triangulation angle that noise alone gives to a pair without baseline, at most."""
+ROTATION_SHARE = 1.3
+"""A pair is a pure rotation when that explains its matches within this factor of what the full pose's median error
+makes one expect; the pose has fitted some of the noise (measured: a factor of 1.05 to 1.25)."""
+ROTATION_NOISE = 2.47
+"""Median error of a rotation over that of an epipolar line for the same noise: sqrt(2) 1.177 (both coordinates of both
+matched points, Rayleigh's median) over 0.6745 (one normal variable)."""
+MIN_FITTING_SHARE, MIN_NUM_FITTING = 0.8, 100
+"""A pair that COLMAP found uncalibrated under a trusted focal length is used where so many of its matches fit a
+calibrated pose: on repeated structure false pairs were seen to reach 74, at shares up to 0.96."""
+MAX_MATCHES_PER_POSE = 1000
+"""Matches of a pair that its pose is refined on, evenly over its list."""
+MAX_MATCHES_PER_CHOICE = 150
+"""Matches by which candidates for a pair's pose are compared: their differences are gross."""
+SAME_MATRIX = 1e-8
+"""Of the cosine between matrices: 0.01 degrees, far less than the refinement moves a pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairGeometry:
+    """Relative poses of pairs and what can be said of them.
+
+    Attributes
+    ----------
+    rotations : (m, 3, 3) array
+        cam2_from_cam1.
+    directions : (m, 3) array
+    angles : (m,) array
+        Median triangulation angles, radians.
+    information : (m, 5, 5) array
+        See `RefinedEdges`.
+    planar : (m,) bool array
+    verdicts : (m,) str array
+    """
+
+    rotations: Array
+    directions: Array
+    angles: Array
+    information: Array
+    planar: BoolArray
+    verdicts: NDArray[np.str_]
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """Rays of all pairs' inliers."""
+
+    offsets: IntArray
+    bearings1: Array
+    bearings2: Array
+
+    @cached_property
+    def _rays(self) -> Matches:
+        variances = np.ones(len(self.offsets) - 1)
+        return Matches.of_rays(self.offsets, self.bearings1, self.bearings2, variances, variances)
+
+    def errors(self, poses: RelativePoses) -> Array:
+        """Absolute Sampson error of each match, radians."""
+        return np.abs(residuals(self._rays, poses.rotations, poses.directions))
+
+    def medians(self, errors: Array) -> Array:
+        """Median of the matches' errors of each pair; infinite for pairs without matches."""
+        return np.nan_to_num(segment_quantiles(self.offsets, errors), nan=np.inf)
+
+    def shares_within(self, errors: Array, bounds: Array) -> Array:
+        """Share of each pair's matches with an error of at most its bound (m,); 0 without matches."""
+        within = errors <= bounds[segment_of_rows(self.offsets)]
+        return segment_sums(self.offsets, within.astype(np.float64)) / np.maximum(np.diff(self.offsets), 1)
+
+    def judged(self, rotations: Array, directions: Array) -> RelativePoses:
+        return judged_poses(rotations, directions, self.offsets, self.bearings1, self.bearings2)
+
+    def of(self, pairs: IntArray) -> "_Matches":
+        rows, offsets = rows_of_segments(self.offsets, pairs)
+        return _Matches(offsets, self.bearings1[rows], self.bearings2[rows])
+
+    def thinned(self, limit: int) -> "_Matches":
+        thin = evenly_thinned(self.offsets, limit)
+        return _Matches(segment_subset(self.offsets, thin), self.bearings1[thin], self.bearings2[thin])
+
+
+def relative_poses(
+    tables: DatabaseTables,
+    focal_scales: Array,
+    focal_trusted: BoolArray,
+    offsets: IntArray,
+    bearings1: Array,
+    bearings2: Array,
+    min_num_inliers: int,
+) -> PairGeometry:
+    """Relative poses of all pairs, with a verdict for each.
+
+    Parameters
+    ----------
+    tables : DatabaseTables
+    focal_scales : (c,) array
+        Factors on the database's focal lengths under which the bearings were taken.
+    focal_trusted : (c,) bool array
+        Where both cameras' focal lengths are, UNCALIBRATED pairs are refused.
+    offsets : (m + 1,) int array
+    bearings1, bearings2 : (k, 3) array
+    min_num_inliers : int
+
+    Returns
+    -------
+    PairGeometry
+    """
+    m = len(tables.pairs)
+    every = _Matches(offsets, bearings1, bearings2)
+    matches = every.thinned(MAX_MATCHES_PER_POSE)
+    cameras = tables.camera_idx[tables.pairs]
+    K = np.array([calibration_matrix(c, s) for c, s in zip(tables.cameras, focal_scales, strict=True)])
+    K = K.reshape(-1, 3, 3)
+    K1, K2 = K[cameras[:, 0]], K[cameras[:, 1]]
+    unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
+
+    few = every.thinned(MAX_MATCHES_PER_CHOICE)
+    E = _essential_matrices(tables, few, K1, K2, unchanged)
+    poses = _better_of_stored_and_decomposed(tables, few, E, unchanged)
+    planar = np.isin(tables.configs, (PLANAR, PLANAR_OR_PANORAMIC))
+    poses = _better_planar(tables, few, K1, K2, planar, poses)
+    focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
+    enough = np.diff(matches.offsets) >= max(min_num_inliers, 5)
+    refined = refine_relative_poses(
+        matches.offsets,
+        matches.bearings1,
+        matches.bearings2,
+        poses.rotations,
+        poses.directions,
+        focal[cameras[:, 0]],
+        focal[cameras[:, 1]],
+    )
+    rotations = np.where(enough[:, None, None], refined.rotations, poses.rotations)
+    directions = np.where(enough[:, None], refined.directions, poses.directions)
+    final = matches.judged(rotations, normalized(directions))
+    errors = matches.errors(final)
+    medians, pair_focal = matches.medians(errors), np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]])
+    turned = _pure_rotation(matches, final, medians)
+    final = replace(final, rotations=np.where(turned[0][:, None, None], turned[1], final.rotations))
+    error_px = medians * pair_focal
+    verdicts = np.full(m, EdgeVerdict.KEPT, dtype=object)
+    verdicts[turned[0] | (tables.configs == PANORAMIC)] = EdgeVerdict.ROTATION_ONLY
+    unexplained = (final.share_in_front < MIN_SHARE_IN_FRONT) & (verdicts == EdgeVerdict.KEPT)
+    verdicts[unexplained | ((error_px > MAX_MEDIAN_ERROR_PX) & ~turned[0])] = EdgeVerdict.NO_POSE
+    fitting = matches.shares_within(errors, MAX_MEDIAN_ERROR_PX / pair_focal)
+    unfit = (fitting < MIN_FITTING_SHARE) | (fitting * np.diff(every.offsets) < MIN_NUM_FITTING)
+    verdicts[(tables.configs == UNCALIBRATED) & focal_trusted[cameras].all(axis=1) & unfit] = EdgeVerdict.UNCALIBRATED
+    verdicts[tables.configs == WATERMARK] = EdgeVerdict.WATERMARK
+    verdicts[tables.configs == DEGENERATE] = EdgeVerdict.DEGENERATE
+    verdicts[np.diff(every.offsets) < min_num_inliers] = EdgeVerdict.FEW_INLIERS
+    return PairGeometry(
+        final.rotations, final.directions, final.median_angles, refined.information, planar, verdicts.astype(str)
+    )
+
+
+def _essential_matrices(tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, unchanged: BoolArray) -> Array:
+    """E where it was found under the same focal lengths, else from F, else refitted from the matches."""
+    E = np.where(unchanged[:, None, None], tables.E, np.nan)
+    from_F = essential_from_fundamental(tables.F, K1, K2)
+    missing = ~_usable(E)
+    E = np.where(missing[:, None, None], from_F, E)
+    missing = ~_usable(E)
+    if missing.any():
+        refitted = estimate_essential_from_inliers(matches.offsets, matches.bearings1, matches.bearings2)
+        E = np.where(missing[:, None, None], refitted, E)
+    return np.where(_usable(E)[:, None, None], E, np.diag([1.0, 1.0, 0.0]))
+
+
+def _better_of_stored_and_decomposed(
+    tables: DatabaseTables, matches: _Matches, E: Array, unchanged: BoolArray
+) -> RelativePoses:
+    """Stored poses that are E's own; else of the stored pose and of E's that which the matches like more."""
+    length = np.linalg.norm(tables.translations, axis=1)
+    with np.errstate(invalid="ignore"):
+        present = unchanged & np.isfinite(tables.rotations).all(axis=(1, 2)) & (length > 0)
+    R = np.where(present[:, None, None], tables.rotations, np.eye(3))
+    t = np.where(present[:, None], tables.translations, np.array([0.0, 0.0, 1.0]))
+    d = normalized(-np.einsum("kba,kb->ka", R, t))
+    stored = matches.judged(R, d)
+    of_stored = essential_from_pose(R, d)
+    cosine = np.einsum("kab,kab->k", of_stored, E) / (
+        np.linalg.norm(E, axis=(1, 2)) * np.linalg.norm(of_stored, axis=(1, 2))
+    )
+    same = present & (np.abs(cosine) > 1.0 - SAME_MATRIX) & (stored.share_in_front > MIN_SHARE_IN_FRONT)
+    rest = np.flatnonzero(~same)
+    if not len(rest):
+        return stored
+    of_rest = matches.of(rest)
+    decomposed = poses_from_essential(E[rest], of_rest.offsets, of_rest.bearings1, of_rest.bearings2)
+    own = stored.of(rest)
+    better = present[rest] & _preferred(of_rest, own, decomposed)
+    return stored.replaced(rest, _where(better, own, decomposed))
+
+
+def _better_planar(
+    tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, planar: BoolArray, poses: RelativePoses
+) -> RelativePoses:
+    """The homography's better decomposition for planar pairs, where the matches like it more than E's pose."""
+    with_H = planar & _usable(tables.H)
+    if not with_H.any():
+        return poses
+    H = np.where(with_H[:, None, None], tables.H, np.eye(3))
+    found = poses_from_homography(
+        calibrated_homography(H, K1, K2), matches.offsets, matches.bearings1, matches.bearings2
+    )
+    return _where(with_H & _preferred(matches, found.better, poses), found.better, poses)
+
+
+def _preferred(matches: _Matches, one: RelativePoses, other: RelativePoses) -> BoolArray:
+    """Whether the matches like one pose more: clearly more of them in front, or as many and a lower median error."""
+    margin = 0.1
+    ahead = one.share_in_front - other.share_in_front
+    closer = matches.medians(matches.errors(one)) < matches.medians(matches.errors(other))
+    return np.asarray((ahead > margin) | ((ahead > -margin) & closer))
+
+
+def _where(mask: BoolArray, one: RelativePoses, other: RelativePoses) -> RelativePoses:
+    rows = np.flatnonzero(mask)
+    return other.replaced(rows, one.of(rows))
+
+
+def _pure_rotation(matches: _Matches, poses: RelativePoses, medians: Array) -> tuple[BoolArray, Array]:
+    """Which pairs a rotation alone explains about as well, and that rotation."""
+    turned, rotations = poses.median_angles < MIN_ANGLE, poses.rotations.copy()
+    suspects = np.flatnonzero(poses.median_angles < MAX_SPURIOUS_ANGLE)
+    of_suspects = matches.of(suspects)
+    found = pure_rotations(of_suspects.offsets, of_suspects.bearings1, of_suspects.bearings2)
+    expected = ROTATION_NOISE * np.maximum(medians[suspects], 1e-4)
+    turned[suspects] |= found.median_errors <= ROTATION_SHARE * expected
+    rotations[suspects] = found.rotations
+    return turned, rotations
+
+
+def _usable(matrices: Array) -> BoolArray:
+    """Matrices that are there: finite and not zero."""
+    return np.asarray(
+        np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.nan_to_num(matrices)).max(axis=(1, 2), initial=0.0) > 0)
+    )

@@ -1,0 +1,301 @@
+"""The viewing graph: images as nodes, verified pairs as edges with relative poses.
+
+Conventions, written down once. World to camera is ``x_cam = R x_world + t`` (COLMAP's ``cam_from_world``).
+
+===================================================  ==========================================================
+paper (Nasiri et al.)                                here
+===================================================  ==========================================================
+``R_i``, camera to world                             ``cam_from_world_rotations[i].T``
+``p_i``                                              ``projection_centers[i]``
+``R_ij = R_j^T R_i``                                 ``cam2_from_cam1_rotations[k]`` for ``edges[k] = (i, j)``
+``gamma^l_ij = R_i^T (p_j - p_i) / ||p_j - p_i||``   ``cam2_in_cam1_directions[k]``, camera 2's centre from camera 1
+===================================================  ==========================================================
+
+With ``cam2_from_cam1 = (R_21, t_21)`` the direction is ``-R_21^T t_21 / ||t_21||``. Image *ids* are the database's;
+image *rows* (`edges`, `camera_idx`) are positions in `image_ids`.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.errors import GraphError
+from colmap_vg.scene.verdicts import EdgeVerdict
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGraph:
+    """All images and verified pairs of a scene, unusable ones too. Arrays are read-only by convention.
+
+    Attributes
+    ----------
+    image_ids : (n,) int64 array
+        Unique ids, the database's.
+    edges : (m, 2) int64 array
+        Rows into `image_ids`, two different ones per edge.
+    cam2_from_cam1_rotations : (m, 3, 3) array
+        Relative rotations.
+    cam2_in_cam1_directions : (m, 3) array
+        Unit vectors from camera 1 towards camera 2, in camera 1's frame.
+    num_inliers : (m,) int64 array or None
+        Verified matches of each edge.
+    camera_idx : (n,) int64 array or None
+        Row of each image's camera in the per-camera arrays.
+    image_names : tuple of str
+        Names in the order of `image_ids`; empty when unknown.
+    camera_ids : (c,) int64 array or None
+        The database's camera ids.
+    camera_focal_lengths : (c,) array or None
+        Mean focal length in pixels under which bearings and relative poses were taken.
+    camera_focal_known : (c,) bool array or None
+        Whether that focal length was given (calibrated, or from EXIF and not contradicted), not found by us.
+    camera_radial : (c,) bool array or None
+        Whether the camera's model has a radial term that may be found with its focal length.
+    read_verdicts : (m,) str array or None
+        `EdgeVerdict` words given on reading; edges other than ``kept`` and ``rotation_only`` are not solved with.
+    trusted : (m,) bool array or None
+        Edges that no filter may drop, on the user's word.
+    found_radial_terms : (c,) array or None
+        Radial terms, at the database's focal lengths, of cameras that the database tells no distortion of. Bearings are
+        taken with them.
+    verified_anew : (m,) bool array or None
+        Pairs whose matches or configuration are not those of the database, which did not explain each other.
+    planar : (m,) bool array or None
+        Pairs explained by a homography; their relative pose is less certain.
+    triangulation_angles : (m,) array or None
+        Median angle between the rays of an edge's inliers, radians.
+    edge_information : (m, 5, 5) array or None
+        Inverse covariance of each relative pose, radians: rotation in camera 2's frame (3), direction in its tangent
+        plane ``tangent_basis(direction)`` (2).
+    inlier_offsets : (m + 1,) int64 array or None
+        Inliers of edge k are rows ``inlier_offsets[k]:inlier_offsets[k + 1]`` of the arrays below.
+    inlier_bearings1, inlier_bearings2 : (k, 3) array or None
+        Unit rays of the matched keypoints in camera 1's and camera 2's frame.
+    inlier_keypoints1, inlier_keypoints2 : (k,) int32 array or None
+        Keypoint indices in image 1 and image 2.
+    """
+
+    image_ids: IntArray
+    edges: IntArray
+    cam2_from_cam1_rotations: Array
+    cam2_in_cam1_directions: Array
+    num_inliers: IntArray | None = None
+    camera_idx: IntArray | None = None
+    image_names: tuple[str, ...] = field(default=(), kw_only=True)
+    camera_ids: IntArray | None = field(default=None, kw_only=True)
+    camera_focal_lengths: Array | None = field(default=None, kw_only=True)
+    camera_focal_known: BoolArray | None = field(default=None, kw_only=True)
+    camera_radial: BoolArray | None = field(default=None, kw_only=True)
+    read_verdicts: NDArray[np.str_] | None = field(default=None, kw_only=True)
+    trusted: BoolArray | None = field(default=None, kw_only=True)
+    found_radial_terms: Array | None = field(default=None, kw_only=True)
+    verified_anew: BoolArray | None = field(default=None, kw_only=True)
+    planar: BoolArray | None = field(default=None, kw_only=True)
+    triangulation_angles: Array | None = field(default=None, kw_only=True)
+    edge_information: Array | None = field(default=None, kw_only=True)
+    inlier_offsets: IntArray | None = field(default=None, kw_only=True)
+    inlier_bearings1: Array | None = field(default=None, kw_only=True)
+    inlier_bearings2: Array | None = field(default=None, kw_only=True)
+    inlier_keypoints1: NDArray[np.int32] | None = field(default=None, kw_only=True)
+    inlier_keypoints2: NDArray[np.int32] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, _array(name, value, kind))
+            elif name in _REQUIRED:
+                raise GraphError(f"ViewGraph.{name} is missing")
+        for names in _TOGETHER:
+            absent = [name for name in names if getattr(self, name) is None]
+            if absent and len(absent) < len(names):
+                raise GraphError(f"ViewGraph.{absent[0]} is missing; {', '.join(names)} go together")
+        self._check_shapes()
+        self._check_values()
+
+    @property
+    def num_images(self) -> int:
+        """Number of images n."""
+        return len(self.image_ids)
+
+    @property
+    def num_edges(self) -> int:
+        """Number of edges m."""
+        return len(self.edges)
+
+    @property
+    def has_rotation(self) -> BoolArray:
+        """Edges whose rotation may be used, (m,)."""
+        if self.read_verdicts is None:
+            return np.ones(self.num_edges, dtype=bool)
+        return np.isin(self.read_verdicts, [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
+
+    @property
+    def has_direction(self) -> BoolArray:
+        """Edges whose rotation and direction may be used, (m,)."""
+        if self.read_verdicts is None:
+            return np.ones(self.num_edges, dtype=bool)
+        return np.asarray(self.read_verdicts == EdgeVerdict.KEPT)
+
+    @property
+    def has_inliers(self) -> bool:
+        """Whether the matched bearings are in the graph."""
+        return self.inlier_offsets is not None and self.inlier_bearings1 is not None and len(self.inlier_bearings1) > 0
+
+    def _check_shapes(self) -> None:
+        n, m = len(self.image_ids), len(self.edges)
+        k = 0 if self.inlier_bearings1 is None else len(self.inlier_bearings1)
+        c = None if self.camera_focal_lengths is None else len(self.camera_focal_lengths)
+        expected: dict[str, tuple[int | None, ...]] = {
+            "image_ids": (n,),
+            "edges": (m, 2),
+            "cam2_from_cam1_rotations": (m, 3, 3),
+            "cam2_in_cam1_directions": (m, 3),
+            "num_inliers": (m,),
+            "camera_idx": (n,),
+            "camera_ids": (c,),
+            "camera_focal_lengths": (c,),
+            "camera_focal_known": (c,),
+            "camera_radial": (c,),
+            "read_verdicts": (m,),
+            "trusted": (m,),
+            "planar": (m,),
+            "verified_anew": (m,),
+            "found_radial_terms": (c,),
+            "triangulation_angles": (m,),
+            "edge_information": (m, 5, 5),
+            "inlier_offsets": (m + 1,),
+            "inlier_bearings1": (k, 3),
+            "inlier_bearings2": (k, 3),
+            "inlier_keypoints1": (k,),
+            "inlier_keypoints2": (k,),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if value.ndim != len(shape) or any(w not in (None, h) for h, w in zip(value.shape, shape, strict=True)):
+                raise GraphError(
+                    f"ViewGraph.{name} has shape {value.shape}, expected {shape} (n={n} images, m={m} edges)"
+                )
+        if self.image_names and len(self.image_names) != n:
+            raise GraphError(f"ViewGraph.image_names holds {len(self.image_names)} names for {n} images")
+
+    def _check_values(self) -> None:
+        n, edges, R, g = self.num_images, self.edges, self.cam2_from_cam1_rotations, self.cam2_in_cam1_directions
+        if len(np.unique(self.image_ids)) != n:
+            raise GraphError("ViewGraph.image_ids are not unique")
+        if len(edges) and (edges.min() < 0 or edges.max() >= n):
+            raise GraphError(f"ViewGraph.edges point outside the {n} images: rows {edges.min()} to {edges.max()}")
+        loops = np.flatnonzero(edges[:, 0] == edges[:, 1])
+        if len(loops):
+            raise GraphError(f"ViewGraph.edges: edge {loops[0]} links image row {edges[loops[0], 0]} to itself")
+        _refuse(
+            "cam2_from_cam1_rotations", np.asarray(~np.isfinite(R).all(axis=(1, 2))), "holds NaN or infinite values"
+        )
+        _refuse("cam2_in_cam1_directions", np.asarray(~np.isfinite(g).all(axis=1)), "holds NaN or infinite values")
+        skewed = np.asarray(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
+        _refuse("cam2_from_cam1_rotations", np.asarray(skewed | (np.linalg.det(R) < 0)), "is no rotation matrix")
+        _refuse(
+            "cam2_in_cam1_directions", np.asarray(np.abs(np.linalg.norm(g, axis=1) - 1.0) > 1e-6), "is no unit vector"
+        )
+        if self.inlier_offsets is not None:
+            o, k = self.inlier_offsets, 0 if self.inlier_bearings1 is None else len(self.inlier_bearings1)
+            if o[0] != 0 or o[-1] != k or (np.diff(o) < 0).any():
+                raise GraphError(f"ViewGraph.inlier_offsets must rise from 0 to the number of inliers {k}")
+        if self.camera_idx is not None and len(self.camera_idx):
+            last = self.camera_idx.max() if self.camera_focal_lengths is None else len(self.camera_focal_lengths) - 1
+            if self.camera_idx.min() < 0 or self.camera_idx.max() > min(last, _MAX_ROW):
+                raise GraphError(f"ViewGraph.camera_idx holds rows that are no camera's: {self.camera_idx.max()}")
+        if self.num_inliers is not None:
+            _refuse("num_inliers", np.asarray(self.num_inliers < 0), "is negative")
+        if self.camera_focal_lengths is not None:
+            f = self.camera_focal_lengths
+            _refuse("camera_focal_lengths", np.asarray(~((f > 0) & (f < np.inf))), "is no focal length in pixels")
+        if self.edge_information is not None:
+            _refuse("edge_information", _no_information(self.edge_information), "is no information matrix")
+        for name in ("inlier_bearings1", "inlier_bearings2"):
+            rays = getattr(self, name)
+            if rays is not None:
+                squared = np.einsum("ka,ka->k", rays, rays)
+                _refuse(name, np.asarray(~(np.abs(squared - 1.0) < 2e-6)), "is no unit vector")
+
+
+_REQUIRED = ("image_ids", "edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions")
+_TOGETHER = (
+    ("inlier_offsets", "inlier_bearings1", "inlier_bearings2"),
+    ("inlier_keypoints1", "inlier_keypoints2"),
+    ("camera_ids", "camera_focal_lengths"),
+)
+_MAX_ROW = 2**31
+"""A larger row number is a mistake, not a camera: arrays of that length would be made for it."""
+
+
+_KINDS: dict[str, type] = {
+    "image_ids": np.int64,
+    "edges": np.int64,
+    "cam2_from_cam1_rotations": np.float64,
+    "cam2_in_cam1_directions": np.float64,
+    "num_inliers": np.int64,
+    "camera_idx": np.int64,
+    "camera_ids": np.int64,
+    "camera_focal_lengths": np.float64,
+    "camera_focal_known": np.bool_,
+    "camera_radial": np.bool_,
+    "read_verdicts": np.str_,
+    "trusted": np.bool_,
+    "planar": np.bool_,
+    "verified_anew": np.bool_,
+    "found_radial_terms": np.float64,
+    "triangulation_angles": np.float64,
+    "edge_information": np.float64,
+    "inlier_offsets": np.int64,
+    "inlier_bearings1": np.float64,
+    "inlier_bearings2": np.float64,
+    "inlier_keypoints1": np.int32,
+    "inlier_keypoints2": np.int32,
+}
+
+
+def _array(name: str, value: object, kind: type) -> NDArray[np.generic]:
+    try:
+        found = np.asarray(value)
+    except ValueError as error:
+        raise GraphError(f"ViewGraph.{name} is no array: {error}") from error
+    if found.ndim == 0:
+        raise GraphError(f"ViewGraph.{name} must be an array, found {found}")
+    if name in ("edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions") and found.size == 0:
+        found = found.reshape(0, *{"edges": (2,), "cam2_from_cam1_rotations": (3, 3)}.get(name, (3,)))
+    allowed, what = _ALLOWED[np.dtype(kind).kind]
+    if found.size and found.dtype.kind not in allowed:
+        raise GraphError(f"ViewGraph.{name} must hold {what}, found {found.dtype}")
+    if (
+        np.dtype(kind).kind == "i"
+        and found.size
+        and (found.max() > np.iinfo(kind).max or found.min() < np.iinfo(kind).min)
+    ):
+        raise GraphError(f"ViewGraph.{name} holds {found.max()}, too large a number")
+    return np.asarray(found, dtype=kind)
+
+
+_ALLOWED = {"i": ("iu", "integers"), "f": ("iuf", "real numbers"), "b": ("b", "True or False"), "U": ("UO", "words")}
+
+
+def _no_information(matrices: Array) -> BoolArray:
+    """Matrices (m, 5, 5) that are not finite, or have a negative variance, or are not symmetric."""
+    with np.errstate(invalid="ignore"):
+        size = np.abs(matrices).max(axis=(1, 2), initial=0.0)
+        skew = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max(axis=(1, 2), initial=0.0)
+        negative = (np.diagonal(matrices, axis1=1, axis2=2) < 0).any(axis=1)
+        return np.asarray(~np.isfinite(size) | negative | (skew > 1e-6 * size))
+
+
+def _refuse(name: str, bad: BoolArray, what: str) -> None:
+    rows = np.flatnonzero(bad)
+    if len(rows):
+        raise GraphError(f"ViewGraph.{name}: row {rows[0]} {what} ({len(rows)} such rows)")

@@ -1,0 +1,1 @@
+"""Scenes with known truth, for research and tests; nothing that users run imports them."""

@@ -1,0 +1,131 @@
+"""Stage 4 of the solver: poses and free lenses at the minimum of all epipolar errors."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar, edge_errors
+from colmap_vg.epipolar.covariance import camera_covariances
+from colmap_vg.epipolar.problem import EpipolarProblem, epipolar_problem, focal_groups
+from colmap_vg.epipolar.radial_term import fit_radial_term
+from colmap_vg.options import SolveOptions
+from colmap_vg.scene.edge_residuals import edge_residual_sigmas
+from colmap_vg.scene.subgraph import Subgraph
+from colmap_vg.scene.verdicts import EdgeVerdict
+from colmap_vg.solver.direction_stage import fixed_part
+from colmap_vg.solver.part_poses import PartPoses
+from colmap_vg.solver.state import SolverState
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+CONTRADICTION = 10.0
+"""Residuals of a pair over those of the median pair, in standard deviations, from which on it is false. What all pairs
+share, a lens not quite as modelled, is in the median; noise of one pair does not reach five."""
+MISFIT, MISFIT_PX = 3.0, 1.0
+"""Median error of a pair's matches at the adjusted cameras from which on they do not fit: over that of the median pair,
+and pixels."""
+
+
+def adjust_poses(
+    state: SolverState, part: Subgraph, problem: EpipolarProblem, poses: PartPoses, options: SolveOptions
+) -> tuple[Subgraph, PartPoses]:
+    """Poses and free focal lengths at the minimum of the epipolar errors.
+
+    Reversed edges leave, and with them images that the rest does not fix: those stood on the wrong side of an edge.
+    """
+    directions = state.graph.cam2_in_cam1_directions[part.edge_rows]
+    found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
+    state.log.extend(found.log)
+    problem, found, radial_terms = _with_radial_term(state, problem, found, directions)
+    state.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
+    # Relative poses of bent rays contradict straight ones, right as both may be.
+    dropped = found.reversed_edges | (_contradicting(state, part, problem, found) & (radial_terms is None))
+    if dropped.sum() > found.reversed_edges.sum():
+        state.drop(part.edge_rows[dropped & ~found.reversed_edges], EdgeVerdict.CONTRADICTS_POSES)
+        rest = problem.without(dropped)
+        kept = part.with_edges(~dropped)
+        if state.largest_rigid_part(kept, options.random_seed).num_images < part.num_images:
+            # Tracks that were not needed before may hold what is left.
+            rest = epipolar_problem(state.graph, kept, options) or rest
+        rest = replace(rest, free_focals=problem.free_focals & ~found.lost_focals)
+        again = adjust_epipolar(
+            rest,
+            found.cam_from_world_rotations,
+            found.projection_centers,
+            directions[~dropped],
+            initial_focal_scales=found.focal_scales,
+            scales_px=(found.scale_px,),
+            final_sigmas=0.0,
+        )
+        state.log.extend(again.log)
+        state.drop(part.edge_rows[~dropped][again.reversed_edges], EdgeVerdict.REVERSED)
+        problem, lost = rest, found.lost_focals | again.lost_focals
+        found = replace(again, lost_focals=lost)
+    group = focal_groups(state.graph)[0]
+    if found.lost_focals.any():
+        count = int(found.lost_focals[group].sum())
+        state.caveats.append(
+            f"The matches do not tell the focal length of {count} of {len(group)} cameras; it stays as it was read."
+        )
+    fixed = fixed_part(state, part, options) if dropped.any() else part
+    rows = part.rows_of(fixed.images)
+    solved = PartPoses(
+        found.cam_from_world_rotations[rows],
+        found.projection_centers[rows],
+        found.focal_scales[group],
+        found.converged,
+        radial_terms=radial_terms,
+    )
+    if options.covariances:
+        known = camera_covariances(problem, found, seed=options.random_seed)
+        solved = replace(solved, covariances=(known.positions[rows], known.rotations[rows]))
+    return fixed, solved
+
+
+def _with_radial_term(
+    state: SolverState, problem: EpipolarProblem, found: AdjustmentResult, directions: Array
+) -> tuple[EpipolarProblem, AdjustmentResult, Array | None]:
+    """The problem, its cameras and the radial terms (c,) after one was found, where lenses are free and ask for it."""
+    graph, (group, first) = state.graph, focal_groups(state.graph)
+    free = problem.free_focals & ~found.lost_focals
+    if graph.camera_radial is None or not free.any():
+        return problem, found, None
+    bendable = free & (np.bincount(group, weights=~graph.camera_radial, minlength=len(first)) == 0)
+    lens = fit_radial_term(problem, found, bendable) if bendable.any() else None
+    if lens is None:
+        return problem, found, None
+    start = lens.result
+    again = adjust_epipolar(
+        lens.problem,
+        start.cam_from_world_rotations,
+        start.projection_centers,
+        directions,
+        initial_focal_scales=start.focal_scales,
+        scales_px=(start.scale_px,),
+    )
+    state.log.extend(again.log)
+    terms = np.where(bendable, lens.radial_term * np.square(again.focal_scales), 0.0)[group]
+    return lens.problem, again, np.asarray(terms)
+
+
+def _contradicting(state: SolverState, part: Subgraph, problem: EpipolarProblem, found: AdjustmentResult) -> BoolArray:
+    """Edges (e,) of a part whose relative poses and matches no noise takes that far from the adjusted cameras."""
+    graph, rows = state.graph, part.edge_rows
+    if graph.edge_information is None:
+        return np.zeros(len(rows), dtype=bool)
+    sigmas = edge_residual_sigmas(
+        part.edges,
+        graph.cam2_from_cam1_rotations[rows],
+        graph.cam2_in_cam1_directions[rows],
+        graph.edge_information[rows],
+        found.cam_from_world_rotations,
+        found.projection_centers,
+    )
+    contradicting = (sigmas > CONTRADICTION * max(float(np.median(sigmas)), 1.0)) & ~state.trusted[rows]
+    if contradicting.any():
+        # A pose by itself may be the worse of two that nearly explain a plane's matches.
+        errors = edge_errors(problem, found)
+        contradicting &= errors > max(MISFIT * float(np.median(errors)), MISFIT_PX)
+    return np.asarray(contradicting)

@@ -1,0 +1,270 @@
+"""State of a solve: verdicts on images and edges so far, the poses placed, and the iteration log."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.geometry import so3
+from colmap_vg.scene.components import components_by_size
+from colmap_vg.scene.edge_residuals import edge_residual_sigmas
+from colmap_vg.scene.solution import Agreement, LogEntry, PoseSolution
+from colmap_vg.scene.subgraph import Subgraph
+from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
+from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.solver.agreement import pair_agreement
+from colmap_vg.solver.rigidity import largest_rigid_component
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+MIN_PART_IMAGES = 3
+"""Of a part that is solved: two images have no more than a direction between them."""
+MIN_AGREEMENT = 0.65
+"""Share of inlier matches below which a model is doubtful. Right models of objects that repeat themselves had 0.74 to
+0.95, those of other photographs 0.98 and more; models that were folded 0.64 to 0.86."""
+
+
+class SolverState:
+    """Verdicts on a graph's images and edges, starting from those given on reading.
+
+    Attributes
+    ----------
+    graph : ViewGraph
+    edge_verdicts : (m,) object array of EdgeVerdict
+    image_verdicts : (n,) object array of ImageVerdict
+    log : list of LogEntry
+    caveats : list of str
+        Sentences on what could not be had in full.
+    """
+
+    def __init__(self, graph: ViewGraph) -> None:
+        read = graph.read_verdicts
+        self.graph = graph
+        self.edge_verdicts: NDArray[np.object_] = (
+            np.full(graph.num_edges, EdgeVerdict.KEPT, dtype=object) if read is None else read.astype(object)
+        )
+        self.image_verdicts: NDArray[np.object_] = np.full(graph.num_images, ImageVerdict.NO_EDGES, dtype=object)
+        self.log: list[LogEntry] = []
+        self.caveats: list[str] = []
+        self._R, self._p = np.full((graph.num_images, 3, 3), np.nan), np.full((graph.num_images, 3), np.nan)
+        self._component = np.full(graph.num_images, -1, dtype=np.int64)
+        self._focal_scales = np.ones(num_cameras(graph))
+        self._radial_terms = np.zeros(num_cameras(graph))
+        self._seen_cameras = np.zeros(num_cameras(graph), dtype=bool)
+        self._converged = True
+        self._covariances: Array | None = None
+        self._in_doubt: BoolArray | None = None
+        self._arrangements: list[Array] = []
+        self._ratios = np.zeros((0, 2), dtype=np.int64)
+
+    @property
+    def usable(self) -> BoolArray:
+        """Edges that no test has dropped so far, (m,)."""
+        return np.isin(self.edge_verdicts.astype(str), [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
+
+    @property
+    def trusted(self) -> BoolArray:
+        """Edges that no test may drop, (m,)."""
+        return np.zeros(self.graph.num_edges, dtype=bool) if self.graph.trusted is None else self.graph.trusted
+
+    def drop(self, edge_rows: IntArray, verdict: EdgeVerdict) -> None:
+        """Drop edges for a reason, but for trusted ones."""
+        self.edge_verdicts[edge_rows[~self.trusted[edge_rows]]] = verdict
+
+    def restore(self, edge_rows: IntArray) -> None:
+        """Take dropped edges back."""
+        self.edge_verdicts[edge_rows] = EdgeVerdict.KEPT
+
+    def note_arrangements(self, part: Subgraph, rotations: tuple[Array, ...]) -> None:
+        """Note rotations (k, 3, 3) of a part, those found and others; of several parts the first, the largest."""
+        if not self._arrangements:
+            for own in rotations:
+                self._arrangements.append(np.full((self.graph.num_images, 3, 3), np.nan))
+                self._arrangements[-1][part.images] = own
+
+    def doubt(self, images: IntArray, told: str) -> None:
+        """Note images whose place is in doubt, and why, in a sentence."""
+        if self._in_doubt is None:
+            self._in_doubt = np.zeros(self.graph.num_images, dtype=bool)
+        self._in_doubt[images] = True
+        self.caveats.append(told)
+
+    def leave_out(self, part: Subgraph, verdict: ImageVerdict) -> None:
+        """Leave out the images of a part for a reason, but for those that have one."""
+        in_question = self.image_verdicts[part.images] == ImageVerdict.REGISTERED
+        self.image_verdicts[part.images[in_question]] = verdict
+
+    def largest_component(self, images: BoolArray, otherwise: ImageVerdict) -> Subgraph:
+        """Largest connected component among the images marked; the others of them that had edges get the verdict."""
+        edges = self.usable & images[self.graph.edges].all(axis=1)
+        linked = np.zeros(self.graph.num_images, dtype=bool)
+        linked[self.graph.edges[edges].ravel()] = True
+        inside = linked & (components_by_size(self.graph.num_images, self.graph.edges[edges]) == 0)
+        in_question = self.image_verdicts == ImageVerdict.REGISTERED
+        in_question |= linked & (self.image_verdicts == ImageVerdict.NO_EDGES)
+        self.image_verdicts[images & in_question & ~inside] = otherwise
+        self.image_verdicts[inside] = ImageVerdict.REGISTERED
+        return Subgraph.of(self.graph.edges, inside, edges)
+
+    def note_ratios(self, edge_rows: IntArray) -> None:
+        """Note pairs (q, 2) of the graph's edges with a firm ratio of lengths, in place of earlier ones."""
+        self._ratios = edge_rows
+
+    def largest_rigid_part(self, part: Subgraph, seed: int) -> Subgraph:
+        """Largest part that directions and ratios of lengths fix; the part's other images become ``not_rigid``."""
+        directed = self.edge_verdicts[part.edge_rows] == EdgeVerdict.KEPT
+        row = np.full(self.graph.num_edges, -1, dtype=np.int64)
+        row[part.edge_rows[directed]] = np.arange(int(directed.sum()))
+        ratios = row[self._ratios]
+        ratios = ratios[(ratios >= 0).all(axis=1)]
+        images, edges = largest_rigid_component(part.num_images, part.edges[directed], seed, ratios)
+        self.image_verdicts[part.images[images]] = ImageVerdict.REGISTERED
+        self.image_verdicts[part.images[~images]] = ImageVerdict.NOT_RIGID
+        inside = np.zeros(self.graph.num_images, dtype=bool)
+        inside[part.images[images]] = True
+        kept = np.zeros(self.graph.num_edges, dtype=bool)
+        kept[part.edge_rows[directed][edges]] = True
+        return Subgraph.of(self.graph.edges, inside, kept)
+
+    def without(self, part: Subgraph, leaving: BoolArray, verdict: ImageVerdict, seed: int) -> Subgraph:
+        """The largest parallel-rigid part after some of a part's images (k,) have left for a reason."""
+        self.image_verdicts[part.images[leaving]] = verdict
+        staying = np.zeros(self.graph.num_images, dtype=bool)
+        staying[part.images[~leaving]] = True
+        kept = np.zeros(self.graph.num_edges, dtype=bool)
+        kept[part.edge_rows] = True
+        return self.largest_rigid_part(Subgraph.of(self.graph.edges, staying, kept), seed)
+
+    def place(
+        self,
+        part: Subgraph,
+        rotations: Array,
+        centers: Array,
+        focal_scales: Array,
+        converged: bool,
+        covariances: tuple[Array, Array] | None = None,
+        radial_terms: Array | None = None,
+    ) -> None:
+        """Take down the poses of a part as a component of its own; centroid 0, root mean square distance 1.
+
+        `covariances` are those of the centres and of the rotations, (k, 3, 3) each.
+        """
+        moved = centers - centers.mean(axis=0)
+        if covariances is not None:
+            self._covariances = (
+                np.full((2, self.graph.num_images, 3, 3), np.nan) if self._covariances is None else self._covariances
+            )
+            self._covariances[0, part.images] = covariances[0] / np.mean(np.sum(moved**2, axis=1))
+            self._covariances[1, part.images] = covariances[1]
+        self._R[part.images] = so3.project(rotations)
+        self._p[part.images] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+        self._component[part.images] = self._component.max(initial=-1) + 1
+        self._converged &= converged
+        if self.graph.camera_idx is not None:
+            # A camera of two components keeps what the larger one found.
+            cameras = np.zeros(len(focal_scales), dtype=bool)
+            cameras[self.graph.camera_idx[part.images]] = True
+            own = cameras & ~self._seen_cameras
+            self._focal_scales[own] = focal_scales[own]
+            if radial_terms is not None:
+                self._radial_terms[own] = radial_terms[own]
+            self._seen_cameras |= cameras
+
+    def solution(self) -> PoseSolution:
+        """What was placed, in the graph's order; unsolvable when nothing was."""
+        component = self._component
+        if component.max(initial=-1) >= 0:
+            sizes = np.bincount(component[component >= 0])
+            rank = np.empty(len(sizes), dtype=np.int64)
+            rank[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
+            component = np.where(component >= 0, rank[component], -1)
+        self.image_verdicts[component == 0] = ImageVerdict.REGISTERED
+        self.image_verdicts[component > 0] = ImageVerdict.OTHER_MODEL
+        ends = component[self.graph.edges]
+        inside = (ends[:, 0] >= 0) & (ends[:, 0] == ends[:, 1])
+        # What only told rotations keeps its word: that may be why its images are outside.
+        self.edge_verdicts[(self.edge_verdicts == EdgeVerdict.KEPT) & ~inside] = EdgeVerdict.OUTSIDE
+        agreement = pair_agreement(self.graph, self._R, self._p, component)
+        in_doubt = self._in_doubt is not None and bool((self._in_doubt & (component >= 0)).any())
+        status, message = described(self.image_verdicts, self._converged, agreement, in_doubt)
+        still = int((self.edge_verdicts == EdgeVerdict.ROTATION_ONLY).sum())
+        if status == SolutionStatus.UNSOLVABLE and still:
+            message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have turned on the spot."
+        return PoseSolution(
+            image_ids=self.graph.image_ids,
+            cam_from_world_rotations=self._R,
+            projection_centers=self._p,
+            registered=component == 0,
+            component=component,
+            focal_scales=self._focal_scales,
+            radial_terms=self._radial_terms if self._radial_terms.any() else None,
+            edge_kept=self.usable & inside,
+            edge_verdicts=self.edge_verdicts.astype(str),
+            image_verdicts=self.image_verdicts.astype(str),
+            status=status,
+            message=message,
+            converged=self._converged,
+            caveats=tuple(self.caveats),
+            position_covariances=None if self._covariances is None else self._covariances[0],
+            rotation_covariances=None if self._covariances is None else self._covariances[1],
+            edge_residual_sigmas=self._edge_residual_sigmas(inside),
+            agreement=agreement,
+            in_doubt=self._in_doubt if in_doubt else None,
+            arrangements=tuple(self._arrangements),
+            log=tuple(self.log),
+        )
+
+    def _edge_residual_sigmas(self, inside: BoolArray) -> Array | None:
+        graph = self.graph
+        if graph.edge_information is None:
+            return None
+        sigmas, rows = np.full(graph.num_edges, np.nan), np.flatnonzero(inside & graph.has_direction)
+        sigmas[rows] = edge_residual_sigmas(
+            graph.edges[rows],
+            graph.cam2_from_cam1_rotations[rows],
+            graph.cam2_in_cam1_directions[rows],
+            graph.edge_information[rows],
+            self._R,
+            self._p,
+        )
+        return sigmas
+
+
+def described(
+    image_verdicts: NDArray[np.generic], converged: bool, agreement: tuple[Agreement, ...], in_doubt: bool
+) -> tuple[SolutionStatus, str]:
+    """Status of a solution, and the sentences that tell it."""
+    words, counts = np.unique(image_verdicts.astype(str), return_counts=True)
+    elsewhere = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
+    if sum(elsewhere.values()) == len(image_verdicts):
+        return SolutionStatus.UNSOLVABLE, (
+            "No three images are linked by directions or tracks that fix their positions: "
+            "add overlapping photographs, taken from different places."
+        )
+    status, message = SolutionStatus.SOLVED, f"All {len(image_verdicts)} images are registered."
+    if elsewhere:
+        reasons = ", ".join(f"{count} {word}" for word, count in elsewhere.items())
+        status = SolutionStatus.PARTIAL
+        message = f"{sum(elsewhere.values())} of {len(image_verdicts)} images are left out of the largest model"
+        message += f" ({reasons}); see image_verdicts."
+    if not converged:
+        status = SolutionStatus.NOT_CONVERGED
+        message += " The iteration limit was reached: raise max_num_iterations, or look for outliers in the graph."
+    if agreement:
+        shares = f"{agreement[0].inliers:.3f} of the inlier matches and {agreement[0].pairs:.3f} of the pairs"
+        message += f" {shares} agree with the model within 5°."
+    if in_doubt or any(part.inliers < MIN_AGREEMENT for part in agreement):
+        status = SolutionStatus.DOUBTFUL
+        why = "another arrangement fits nearly as well" if in_doubt else "too many pairs contradict it"
+        message += (
+            f" The model is doubtful: {why}. Look at it, exclude pairs that are wrong, or add photographs between the"
+            " views that look alike."
+        )
+    return status, message
+
+
+def num_cameras(graph: ViewGraph) -> int:
+    """Number of cameras that a graph tells of; 0 when it tells of none."""
+    if graph.camera_focal_lengths is not None:
+        return len(graph.camera_focal_lengths)
+    return 0 if graph.camera_idx is None or len(graph.camera_idx) == 0 else int(graph.camera_idx.max()) + 1

@@ -1,0 +1,1 @@
+"""Mappers and stages beside each other: runs in fresh processes, ratios, growth with the number of images."""

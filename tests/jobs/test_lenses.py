@@ -1,0 +1,221 @@
+"""Lenses with given calibrations, seen wide: believed where they are right, kept where that is asked, never dropped."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic_databases import centers, look_at, make_database
+
+from colmap_vg import MappingOptions, align_positions, read_view_graph
+from colmap_vg.colmap_io.reconstruction import loaded_cache
+from colmap_vg.events import StageLog
+from colmap_vg.jobs.mapper import map_database
+from colmap_vg.reading.distortion import undistorted
+
+WIDTH, HEIGHT, NUM_IMAGES = 1200, 900, 14
+LENSES = {
+    "SIMPLE_RADIAL": (450.0, 600.0, 450.0, -0.1),
+    "RADIAL": (600.0, 600.0, 450.0, -0.25, 0.05),
+    "PINHOLE": (600.0, 780.0, 600.0, 450.0),
+    "OPENCV": (600.0, 600.0, 600.0, 450.0, -0.25, 0.05, 0.0, 0.0),
+    "FULL_OPENCV": (600.0, 600.0, 600.0, 450.0, -0.25, 0.05, 0.0, 0.0, 0.002, 0.0, 0.0, 0.0),
+    "FOV": (600.0, 600.0, 600.0, 450.0, 0.9),
+    "EUCM": (600.0, 600.0, 600.0, 450.0, 0.6, 1.1),
+    "OPENCV_FISHEYE": (450.0, 450.0, 600.0, 450.0, 0.02, -0.004, 0.0, 0.0),
+}
+
+
+def write_room(
+    path: Path, lens: pycolmap.Camera, stored: pycolmap.Camera, noise_px: float = 0.5, seed: int = 0
+) -> np.ndarray:
+    """A walk in a room with one lens, pairs verified by pycolmap under the calibration that is stored; the centres."""
+    rng = np.random.default_rng(seed)
+    turn = 2.0 * np.pi * np.arange(NUM_IMAGES) / NUM_IMAGES
+    p = np.stack([1.5 * np.cos(turn), 0.15 * rng.standard_normal(NUM_IMAGES), 1.5 * np.sin(turn)], axis=1)
+    targets = np.stack([-4.0 * np.cos(turn + 0.2), np.zeros(NUM_IMAGES), -4.0 * np.sin(turn + 0.2)], axis=1)
+    wall, X = rng.integers(6, size=900), rng.uniform(-1.0, 1.0, (900, 3))
+    X[np.arange(900), wall // 2] = np.where(wall % 2 == 0, 1.0, -1.0)
+    X *= np.array([4.0, 2.0, 4.0]) * rng.uniform(0.9, 1.0, (900, 1))
+    poses = [look_at(c, t) for c, t in zip(p, targets, strict=True)]
+    seen, keypoints = [], []
+    for pose in poses:
+        local = X @ pose.rotation.matrix().T + pose.translation
+        near_axis = np.flatnonzero(local[:, 2] > np.linalg.norm(local, axis=1) * np.cos(np.radians(70.0)))
+        pixels = np.asarray(lens.img_from_cam(local[near_axis]))
+        inside = (pixels > 0).all(axis=1) & (pixels < [WIDTH, HEIGHT]).all(axis=1)
+        # Polynomials turn back beyond their range: no lens sees there.
+        back = np.asarray(lens.cam_from_img(np.nan_to_num(pixels))) - local[near_axis, :2] / local[near_axis, 2:]
+        found = inside & (np.abs(back).max(axis=1) < 1e-3) & (rng.random(len(pixels)) < 0.85)
+        seen.append(near_axis[found])
+        keypoints.append(pixels[found] + noise_px * rng.standard_normal((int(found.sum()), 2)))
+    pycolmap.set_random_seed(seed)
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        database.write_camera(stored, use_camera_id=True)
+        for row in range(NUM_IMAGES):
+            database.write_image(pycolmap.Image(name=f"{row}.jpg", camera_id=1, image_id=row + 1), use_image_id=True)
+            database.write_keypoints(row + 1, keypoints[row].astype(np.float32))
+        for i in range(NUM_IMAGES):
+            for j in range(i + 1, NUM_IMAGES):
+                _, a, b = np.intersect1d(seen[i], seen[j], return_indices=True)
+                if len(a) >= 30:
+                    matches = np.stack([a, b], axis=1).astype(np.uint32)
+                    wrong = rng.random(len(a)) < 0.05
+                    matches[wrong, 1] = rng.integers(len(keypoints[j]), size=int(wrong.sum()))
+                    database.write_matches(i + 1, j + 1, matches)
+                    geometry = pycolmap.estimate_two_view_geometry(stored, keypoints[i], stored, keypoints[j], matches)
+                    database.write_two_view_geometry(i + 1, j + 1, geometry)
+    return p
+
+
+def camera(model: str, params: tuple[float, ...]) -> pycolmap.Camera:
+    return pycolmap.Camera(
+        camera_id=1, model=model, width=WIDTH, height=HEIGHT, params=list(params), has_prior_focal_length=True
+    )
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_right_calibration_is_believed(model: str, tmp_path: Path) -> None:
+    lens = camera(model, LENSES[model])
+    truth = write_room(tmp_path / "a.db", lens, lens)
+    graph = read_view_graph(tmp_path / "a.db")
+    assert graph.camera_focal_known.all()
+    assert graph.camera_focal_lengths[0] == lens.mean_focal_length()
+    for refine in (False, True):
+        options = MappingOptions(ba_refine_focal_length=refine, ba_refine_extra_params=refine)
+        log = StageLog()
+        result = map_database(tmp_path / "a.db", None, tmp_path / f"out{refine}", options, log)
+        ids = sorted(result.models[0].reg_image_ids())
+        assert ids == list(range(1, NUM_IMAGES + 1))
+        errors, _ = align_positions(centers(result.models[0], ids), truth)
+        assert errors.mean() < 0.005 * 1.5
+        assert not log.warnings
+        if not refine:
+            assert list(result.models[0].camera(1).params) == list(LENSES[model])
+
+
+def test_a_wrong_focal_length_that_must_stay_stays_with_a_warning(tmp_path: Path) -> None:
+    stored = camera("PINHOLE", (800.0, 800.0, 600.0, 450.0))
+    write_room(tmp_path / "a.db", camera("PINHOLE", (600.0, 600.0, 600.0, 450.0)), stored)
+    log = StageLog()
+    options = MappingOptions(ba_refine_focal_length=False, ba_refine_extra_params=False)
+    result = map_database(tmp_path / "a.db", None, tmp_path / "out", options, log)
+    assert list(result.models[0].camera(1).params) == list(stored.params)
+    (told,) = [warning for warning in log.warnings if "kept as asked" in warning]
+    assert "not the 800.0 px" in told
+    free = map_database(tmp_path / "a.db", None, tmp_path / "free", MappingOptions(), StageLog())
+    assert abs(free.models[0].camera(1).mean_focal_length() - 600.0) < 6.0
+
+
+@pytest.mark.parametrize(
+    ("focal", "term", "prior"), [(600.0, -0.2, True), (600.0, -0.2, False), (900.0, -0.2, True), (900.0, 0.0, True)]
+)
+def test_distortion_that_nobody_told_is_found(focal: float, term: float, prior: bool, tmp_path: Path) -> None:
+    lens = camera("SIMPLE_RADIAL", (focal, 600.0, 450.0, term))
+    stored = camera("SIMPLE_RADIAL", (focal if prior else 1.2 * WIDTH, 600.0, 450.0, 0.0))
+    stored.has_prior_focal_length = prior
+    truth = write_room(tmp_path / "a.db", lens, stored)
+    log = StageLog()
+    result = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log)
+    ids = sorted(result.models[0].reg_image_ids())
+    assert ids == list(range(1, NUM_IMAGES + 1))
+    errors, _ = align_positions(centers(result.models[0], ids), truth)
+    assert errors.mean() < 0.006 * 1.5
+    found = result.models[0].camera(1)
+    assert abs(found.params[3] - term) < 0.01
+    assert abs(found.params[0] / focal - 1.0) < 0.01
+    assert any("tells no distortion" in warning for warning in log.warnings) == (term != 0.0)
+
+
+def test_poses_without_points_have_the_lens_that_was_found(tmp_path: Path) -> None:
+    stored = camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, 0.0))
+    write_room(tmp_path / "a.db", camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, -0.2)), stored)
+    graph = read_view_graph(tmp_path / "a.db")
+    assert abs(graph.found_radial_terms[0] + 0.2) < 0.03
+    before = (tmp_path / "a.db").read_bytes()
+    with loaded_cache(tmp_path / "a.db", tmp_path, 15, graph=graph) as (cache, _):
+        assert cache.camera(1).params[3] == pytest.approx(graph.found_radial_terms[0])
+    assert (tmp_path / "a.db").read_bytes() == before
+
+
+def test_distortion_is_not_looked_for_where_it_must_stay(tmp_path: Path) -> None:
+    stored = camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, 0.0))
+    write_room(tmp_path / "a.db", camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, -0.1)), stored)
+    options = MappingOptions(ba_refine_extra_params=False, ba_refine_focal_length=False)
+    result = map_database(tmp_path / "a.db", None, tmp_path / "out", options, StageLog())
+    assert list(result.models[0].camera(1).params) == list(stored.params)
+
+
+@pytest.mark.parametrize("kappa", [-0.3, -0.05, 0.0, 0.2])
+def test_undistorted_points_distort_back(kappa: float) -> None:
+    u = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
+    r = np.linalg.norm(u, axis=1, keepdims=True)
+    assert np.allclose(undistorted(u * (1.0 + kappa * r**2), kappa), u, atol=1e-9)
+    if kappa < 0:
+        assert np.isnan(undistorted(np.array([[0.0, 5.0]]), kappa)).all()
+
+
+@pytest.mark.parametrize(("given", "told"), [(True, "kept as they came"), (False, "they are 0")])
+@pytest.mark.parametrize("model", ["FULL_OPENCV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"])
+def test_coefficients_that_run_away_are_taken_back(model: str, given: bool, told: str, tmp_path: Path) -> None:
+    """Narrow views tell no terms of high order: bundle adjustment plays them against each other."""
+    size = {"FULL_OPENCV": 8, "THIN_PRISM_FISHEYE": 8, "RAD_TAN_THIN_PRISM_FISHEYE": 12}[model]
+    params = (2600.0, 2600.0, 512.0, 384.0) + (0.001,) * size
+    truth = make_database(tmp_path / "a.db", num_images=8, num_points=60, noise_px=0.5, camera=(model, params))
+    if not given:
+        with pycolmap.Database.open(tmp_path / "a.db") as database:
+            lens = database.read_all_cameras()[0]
+            lens.params = [*params[:4], *[0.0] * size]
+            database.update_camera(lens)
+    log = StageLog()
+    found = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log).models[0]
+    lens, ids = found.camera(1), sorted(truth.reg_image_ids())
+    assert lens.model_name == model
+    assert len(lens.params) == len(params)
+    assert np.abs(lens.params[4:]).max() < 1.0
+    assert any(told in warning and model in warning for warning in log.warnings)
+    assert not any("no real lens" in warning for warning in log.warnings)
+    true_centers = centers(truth, ids)
+    errors, _ = align_positions(centers(found, ids), true_centers)
+    assert errors.mean() < 1e-3 * np.linalg.norm(true_centers - true_centers.mean(axis=0), axis=1).mean()
+    if given:
+        assert list(lens.params[4:]) == list(params[4:])
+
+
+def test_coefficients_that_the_photographs_tell_are_found_without_a_warning(tmp_path: Path) -> None:
+    params = (2600.0, 2600.0, 512.0, 384.0, -0.05, 0.01, 0.0, 0.0)
+    make_database(tmp_path / "a.db", num_images=8, num_points=60, noise_px=0.5, camera=("OPENCV", params))
+    log = StageLog()
+    map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log)
+    assert not log.warnings
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "FOV"])
+def test_lenses_far_from_where_they_start_are_adjusted_to_the_end(model: str, tmp_path: Path) -> None:
+    """One radial term stands for the lens at first; the focal length is 5 to 60 % off then."""
+    params = {"OPENCV": (600.0, 612.0, 600.0, 450.0, -0.12, 0.02, 0.001, -0.001), "FOV": LENSES["FOV"]}[model]
+    stored = camera(
+        model, {"OPENCV": (1440.0, 1440.0, 600.0, 450.0, *[0.0] * 4), "FOV": (780.0, 780.0, 600.0, 450.0, 0.01)}[model]
+    )
+    truth = write_room(tmp_path / "a.db", camera(model, params), stored)
+    found = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), StageLog()).models[0]
+    ids = sorted(found.reg_image_ids())
+    assert ids == list(range(1, NUM_IMAGES + 1))
+    errors, _ = align_positions(centers(found, ids), truth)
+    assert errors.mean() < 0.003 * 1.5
+    assert np.allclose(found.camera(1).params[:2], params[:2], rtol=0.01)
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.5])
+def test_pixels_that_are_not_square_are_found_without_a_prior(noise_px: float, tmp_path: Path) -> None:
+    """Without noise the votes of pairs seem exact, while all of them are wrong by what one focal length leaves out."""
+    stored = camera("PINHOLE", (1440.0, 1440.0, 600.0, 450.0))
+    stored.has_prior_focal_length = False
+    truth = write_room(tmp_path / "a.db", camera("PINHOLE", (1040.0, 1092.0, 600.0, 450.0)), stored, noise_px, seed=1)
+    graph = read_view_graph(tmp_path / "a.db")
+    assert abs(graph.camera_focal_lengths[0] / 1066.0 - 1.0) < 0.08
+    found = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), StageLog()).models[0]
+    ids = sorted(found.reg_image_ids())
+    assert ids == list(range(1, NUM_IMAGES + 1))
+    errors, _ = align_positions(centers(found, ids), truth)
+    assert errors.mean() < 0.01 * 1.5

@@ -1,0 +1,26 @@
+"""What is said of focal lengths that no pair can check."""
+
+from pathlib import Path
+
+import pytest
+from synthetic_databases import changed_copy, make_database
+
+from colmap_vg import ReadOptions
+from colmap_vg.reading.read import read_with_caveats
+
+CHANGES = {
+    "in 15 pairs all matches are on one plane": "UPDATE two_view_geometries SET config = 4",
+    "or the camera turned on the spot": "UPDATE two_view_geometries SET config = 5",
+    "COLMAP found no geometry for the pairs": "UPDATE two_view_geometries SET config = 1",
+    "no pair has the 16 matches": "UPDATE two_view_geometries SET rows = 15, data = substr(data, 1, 120)",
+}
+
+
+@pytest.mark.parametrize("reason", CHANGES)
+def test_the_reason_is_the_true_one(reason: str, tmp_path: Path) -> None:
+    make_database(tmp_path / "a.db", num_images=6, num_points=100)
+    path = changed_copy(tmp_path / "a.db", tmp_path / "b.db", CHANGES[reason])
+    _, caveats = read_with_caveats(path, ReadOptions())
+    (told,) = [caveat for caveat in caveats if "focal lengths" in caveat]
+    assert told.startswith("The focal lengths cannot be checked")
+    assert reason in told
