@@ -31,7 +31,3 @@ class OutputError(ColmapVgError):
 
 class MappingError(ColmapVgError):
     """No model could be made from the data."""
-
-
-class MissingDependencyError(ColmapVgError, ImportError):
-    """An optional package is needed; the message says what to install."""

@@ -68,7 +68,6 @@ class ReadOptions(_Checked):
     max_num_inliers_per_edge: int = _number(0, 0)  # matches kept as bearings per edge, spread over the image; 0: all
     excluded_pairs_path: str | PathLike[str] | None = None  # file with two image names a line: pairs not to be used
     trusted_pairs_path: str | PathLike[str] | None = None  # the same: pairs that no filter may drop
-    num_threads: int = _number(-1, -1)  # -1: all cores
     random_seed: int = _number(0, 0)
 
 
@@ -146,4 +145,4 @@ class MappingOptions(_Checked):
     extract_colors: bool = True
     overwrite: bool = False
     num_threads: int = _number(-1, -1)  # -1: all cores
-    random_seed: int = _number(0, 0)
+    random_seed: int = _number(0, 0)  # of all stages, in place of those in read and solve

@@ -183,9 +183,7 @@ def run(
             random_seed=_seed(random_seed),
         )
         options = _mapping_options(
-            _read_options(
-                trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, num_threads, random_seed
-            ),
+            _read_options(trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, random_seed),
             _solve_options(
                 method,
                 rotation_averaging,
@@ -251,9 +249,7 @@ def mapper(
         raise typer.BadParameter(str(error)) from None
     with _job(quiet, verbose) as reporter:
         options = _mapping_options(
-            _read_options(
-                trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, num_threads, random_seed
-            ),
+            _read_options(trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, random_seed),
             _solve_options(
                 method,
                 rotation_averaging,
@@ -295,7 +291,7 @@ def solve(
     trusted_pairs_path: TrustedPairs = None,
     min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
     ba_refine_focal_length: RefineFocalLength = "1",
-    num_threads: NumThreads = -1,
+    num_threads: NumThreads = -1,  # noqa: ARG001  -- of every verb; the solver itself has one thread
     random_seed: RandomSeed = 0,
     overwrite: Overwrite = False,
     resume: Resume = False,
@@ -304,9 +300,7 @@ def solve(
 ) -> None:
     """The viewing graph only: OUT/0 holds poses without points."""
     with _job(quiet, verbose) as reporter:
-        read = _read_options(
-            trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, num_threads, random_seed
-        )
+        read = _read_options(trust_focal_lengths, min_num_matches, excluded_pairs_path, trusted_pairs_path, random_seed)
         options = _solve_options(
             method,
             rotation_averaging,
@@ -417,7 +411,6 @@ def _read_options(
     min_num_matches: int,
     excluded_pairs_path: Path | None,
     trusted_pairs_path: Path | None,
-    num_threads: int,
     random_seed: int,
 ) -> ReadOptions:
     return ReadOptions(
@@ -425,7 +418,6 @@ def _read_options(
         trusted_pairs_path=trusted_pairs_path,
         min_num_inliers=min_num_matches,
         trust_focal_lengths=trust_focal_lengths,  # type: ignore[arg-type]
-        num_threads=num_threads,
         random_seed=_seed(random_seed),
     )
 

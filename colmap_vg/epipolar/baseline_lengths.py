@@ -13,9 +13,7 @@ leave lengths along a line of cameras to the noise; here they are measured.
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from colmap_vg.epipolar.depth_agreement import TripletPoses, inverse_depths
 from colmap_vg.epipolar.problem import EpipolarProblem
@@ -23,6 +21,7 @@ from colmap_vg.linear.reweighted import ReweightedLaplacian
 from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, MAD_TO_SIGMA, cauchy_weight, geman_mcclure_weight
 from colmap_vg.positions.fixed_point import LaplacianSystem, edge_lengths
 from colmap_vg.positions.result import centered, spread
+from colmap_vg.scene.components import components_by_size
 from colmap_vg.two_view.segments import segment_quantiles, segment_subset
 
 Array = NDArray[np.float64]
@@ -123,9 +122,7 @@ def solve_lengths(num_edges: int, links: LengthLinks) -> Array:
     if len(links.edges) == 0:
         return lengths
     first, second = links.edges.T
-    joined = sp.coo_array((np.ones(len(first)), (first, second)), shape=(num_edges, num_edges))
-    group = connected_components(joined, directed=False)[1]
-    largest = group == np.bincount(group).argmax()
+    largest = components_by_size(num_edges, links.edges) == 0
     used, number = largest[first], np.cumsum(largest) - 1
     first, second, ratios = number[first[used]], number[second[used]], links.log_ratios[used]
     weights = 1.0 / (links.sigmas[used] ** 2 + LEAST_SIGMA**2)
@@ -148,9 +145,7 @@ def solve_lengths(num_edges: int, links: LengthLinks) -> Array:
 
 def connects_all(num_images: int, edges: IntArray, known: BoolArray) -> bool:
     """Whether the known ones of the edges (m, 2) join all images."""
-    i, j = edges[known].T
-    graph = sp.coo_array((np.ones(len(i)), (i, j)), shape=(num_images, num_images))
-    return int(connected_components(graph, directed=False, return_labels=False)) == 1
+    return bool((components_by_size(num_images, edges[known]) == 0).all())
 
 
 def positions_by_lengths(

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from colmap_vg.epipolar.adjustment import AdjustmentResult, Cameras, edge_chain, triplet_chain
 from colmap_vg.epipolar.depth_agreement import depth_derivatives_by_block, depth_equations
@@ -24,6 +23,7 @@ from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem
 from colmap_vg.geometry import so3
 from colmap_vg.linear.robust_losses import MAD_TO_SIGMA, cauchy_weight
+from colmap_vg.scene.components import components_by_size
 from colmap_vg.two_view.sampson import derivatives_by_block, normal_equations
 from colmap_vg.two_view.segments import segment_of_rows
 
@@ -201,8 +201,7 @@ def _noise(kinds: list[_Residuals], scale_px: float, num_parameters: int) -> tup
         [kind.keypoints[[0, s]] for kind in kinds for s in range(1, len(kind.keypoints))],
     )
     joined = np.concatenate(links, axis=1)
-    graph = sp.coo_array((np.ones(joined.shape[1]), (joined[0], joined[1])), shape=(count, count))
-    num_points = connected_components(graph, directed=False)[0]
+    num_points = int(components_by_size(count, joined.T).max()) + 1
     # Two numbers a keypoint, of which a point takes three and the cameras theirs.
     num_constraints = 2 * count - 3 * num_points
     freedom = num_constraints / max(num_constraints - num_parameters, 1)

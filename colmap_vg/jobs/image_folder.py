@@ -18,6 +18,7 @@ from colmap_vg.features.extraction import UNREADABLE, FeatureResult, check_photo
 from colmap_vg.features.isolated import extract_features_apart, match_features_apart
 from colmap_vg.features.photographs import SkippedFile
 from colmap_vg.features.staging import readable_folder
+from colmap_vg.jobs.atomic_write import atomic_write
 from colmap_vg.jobs.mapper import view_graph_mapping
 from colmap_vg.jobs.output_folder import WORK_NAME, lock_descriptors, output_lock, refuse_models, work_folder
 from colmap_vg.options import FeatureOptions, MappingOptions
@@ -142,13 +143,11 @@ def _start_afresh(finished: Path, unfinished: Path, record_path: Path, record: d
         record_path.unlink(missing_ok=True)
         for path in (finished, *unfinished.parent.glob(f"{DATABASE_NAME}*")):
             path.unlink(missing_ok=True)
-        written = record_path.with_suffix(".new")
-        written.write_text(json.dumps(record, indent=1), encoding="utf-8")
-        written.replace(record_path)
     except OSError as error:
         raise OutputError(
             f"cannot write to {record_path.parent}: {error.strerror}; choose another output_path"
         ) from error
+    atomic_write(record_path, json.dumps(record, indent=1))
 
 
 def _record(image_path: str | PathLike[str], names: list[str], options: FeatureOptions) -> dict[str, object]:

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_vg.errors import OutputError
+from colmap_vg.jobs.atomic_write import atomic_write
 from colmap_vg.jobs.output_folder import WORK_NAME, existing_models, output_lock, refuse_models
 from colmap_vg.jobs.summary import FILE_NAME as SUMMARY_NAME
 from colmap_vg.jobs.summary import plain
@@ -78,14 +78,14 @@ def recorded_job(
             return
         interrupted = before.get("finished") is False
         refuse_models(output_path, overwrite or interrupted)
-        _write(path, {**job, "finished": False})
+        atomic_write(path, json.dumps({**job, "finished": False}, indent=1))
         try:
             yield JobState(finished=False, overwrite=overwrite or interrupted)
         except BaseException:
             if not existing_models(output_path):
                 path.unlink(missing_ok=True)
             raise
-        _write(path, {**job, "finished": True})
+        atomic_write(path, json.dumps({**job, "finished": True}, indent=1))
 
 
 def _inputs(asked: object) -> object:
@@ -131,14 +131,3 @@ def _read(path: Path) -> dict[str, object]:
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
-
-
-def _write(path: Path, content: Mapping[str, object]) -> None:
-    written = path.with_suffix(".new")
-    try:
-        written.write_text(json.dumps(content, indent=1), encoding="utf-8")
-        written.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            written.unlink()
-        raise OutputError(f"cannot write {path}: {error.strerror}; make room or choose another output_path") from error

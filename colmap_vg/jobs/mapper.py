@@ -339,7 +339,7 @@ def _pair_rotations(graph: ViewGraph) -> PairRotations:
 
 def _read(database_path: str | PathLike[str], options: MappingOptions, log: StageLog) -> ViewGraph:
     with log.stage("view graph"):
-        read = replace(options.read, num_threads=options.num_threads, random_seed=options.random_seed)
+        read = replace(options.read, random_seed=options.random_seed)
         if not options.ba_refine_focal_length:
             # Who keeps bundle adjustment from focal lengths wants them as they are.
             read = replace(read, trust_focal_lengths="always")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from colmap_vg._version import __version__
 from colmap_vg.errors import OutputError
 from colmap_vg.events import StageRecord
+from colmap_vg.jobs.atomic_write import atomic_write
 
 if TYPE_CHECKING:
     import pycolmap
@@ -78,12 +79,7 @@ def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
     OutputError
         The file cannot be written.
     """
-    temporary = output_path / f".{FILE_NAME}.{os.getpid()}"
-    try:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        temporary.replace(output_path / FILE_NAME)
-    except OSError as error:
-        raise OutputError(f"cannot write {output_path / FILE_NAME}: {error.strerror}") from error
+    atomic_write(output_path / FILE_NAME, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def told_bridges(output_path: Path) -> list[str]:

@@ -6,7 +6,6 @@ relative pose is from that of the finished model.
 
 import csv
 import io
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.errors import DataFileError, OutputError
+from colmap_vg.errors import DataFileError
+from colmap_vg.jobs.atomic_write import atomic_write
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.scene.view_graph import ViewGraph
@@ -150,12 +150,7 @@ def write_tables(output_path: Path, tables: VerdictTables) -> None:
         writer = csv.writer(text)
         writer.writerow(columns)
         writer.writerows([[getattr(row, column) for column in columns] for row in rows])
-        temporary = output_path / f".{name}.{os.getpid()}"
-        try:
-            temporary.write_text(text.getvalue(), encoding="utf-8", errors="surrogateescape", newline="")
-            temporary.replace(output_path / name)
-        except OSError as error:
-            raise OutputError(f"cannot write {output_path / name}: {error.strerror}") from error
+        atomic_write(output_path / name, text.getvalue())
 
 
 def read_tables(output_path: Path) -> VerdictTables:

@@ -28,8 +28,3 @@ def cauchy_weight(s: Array) -> Array:
 def cauchy_loss(s: Array) -> Array:
     """``rho(s) = log(1 + s)``."""
     return np.log1p(s)
-
-
-def huber_weight(s: Array) -> Array:
-    """``rho(s) = s`` up to 1, then ``2 sqrt(s) - 1``; weight 1, then ``1 / sqrt(s)``."""
-    return np.asarray(1.0 / np.sqrt(np.maximum(s, 1.0)))

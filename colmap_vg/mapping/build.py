@@ -45,18 +45,12 @@ class BuildResult:
 
     Attributes
     ----------
-    added : frozenset of int
-        Ids of images that were registered against the triangulated points.
-    removed : frozenset of int
-        Ids of images that left because too few points fix them.
     misplaced : frozenset of int
         Ids of images that points would have placed where their pairs contradict it.
     folded : bool
         Whether parts are held together by points alone, against what all pairs between them tell.
     """
 
-    added: frozenset[int]
-    removed: frozenset[int]
     misplaced: frozenset[int] = frozenset()
     folded: bool = False
 
@@ -135,7 +129,7 @@ def build_model(
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
-    return BuildResult(frozenset(added), frozenset(removed), frozenset(misplaced), folded)
+    return BuildResult(frozenset(misplaced), folded)
 
 
 def _focal_lengths(reconstruction: "pycolmap.Reconstruction") -> NDArray[np.float64]:

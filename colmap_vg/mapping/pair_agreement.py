@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
+from colmap_vg.scene.components import components_by_size
 from colmap_vg.scene.edge_residuals import rotation_residuals
 
 Array = NDArray[np.float64]
@@ -98,8 +97,11 @@ def _compared(
 
 def _detached(ids: IntArray, edges: IntArray, with_pairs: IntArray) -> tuple[frozenset[int], ...]:
     """Parts besides the largest of the graph of agreeing pairs; images without any pair are none."""
-    graph = sp.coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(ids), len(ids)))
-    part = connected_components(graph, directed=False)[1][with_pairs]
+    part = components_by_size(len(ids), edges)[with_pairs]
+    largest = part.min(initial=0)
     sizes = np.bincount(part)
-    order = np.argsort(-sizes, kind="stable")[1:]
-    return tuple(frozenset(ids[with_pairs[part == k]].tolist()) for k in order.tolist() if sizes[k] >= MIN_PART_IMAGES)
+    return tuple(
+        frozenset(ids[with_pairs[part == k]].tolist())
+        for k in np.flatnonzero(sizes >= MIN_PART_IMAGES).tolist()
+        if k != largest
+    )

@@ -22,7 +22,7 @@ MIN_SHARE_STILL = 0.5
 """Of pairs whose median match stands still, above which the camera does. Half of the pairs of a camera that moves by so
 little tell no direction either."""
 MATCHES_LOOKED_AT, MIN_NUM_MATCHES = 50, 15
-"""Of a pair, to be asked; COLMAP's least number of inliers."""
+"""Matches of a pair whose median is taken, and the least number that makes one: COLMAP's of inliers."""
 
 
 def without_still_background(

@@ -73,7 +73,7 @@ def test_glomaps_refinement_flags(jobs: Jobs) -> None:
 @pytest.mark.parametrize("prefix", ["--", "--Mapper.", "--GlobalMapper."])
 def test_threads_seed_and_matches_reach_every_stage(jobs: Jobs, prefix: str) -> None:
     options = mapping(jobs, f"{prefix}num_threads", "3", f"{prefix}random_seed", "7", f"{prefix}min_num_matches", "20")
-    assert options.num_threads == options.read.num_threads == 3
+    assert options.num_threads == 3
     assert options.random_seed == options.read.random_seed == options.solve.random_seed == 7
     assert options.read.min_num_inliers == 20
     assert mapping(jobs, f"{prefix}random_seed", "-1").random_seed == 0
