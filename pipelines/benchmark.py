@@ -23,8 +23,8 @@ from benchmark.growth import Timing, growth_table, looped_scene, timed_rotation_
 from benchmark.mapper_runs import MAPPERS, MapperRun, alternate, compared
 from benchmark.photograph_runs import WAYS, PhotographRun, alternate_ways, compared_ways
 from paper.markdown import markdown_table
+from paper.plots import growth_svg
 from paper.scenes import set_conditions, simulated_scene, topology_sets
-from paper.svg import growth_svg
 
 import colmap_vg
 from colmap_vg.demo.photographs import render_photographs

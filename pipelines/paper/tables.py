@@ -22,9 +22,9 @@ from colmap_vg.options import Method
 from colmap_vg.simulation.six_vertices import SIX_CENTERS, SIX_EDGES
 from paper.figures import EdgeErrors, edge_errors, scale_factors, shares_outside
 from paper.markdown import csv_text, markdown_table
+from paper.plots import bars_svg, histogram_svg, points_svg
 from paper.position_table import MethodErrors, solve_with, table_1, wins
 from paper.scenes import KnownScene, real_scene, set_conditions, simulated_scene
-from paper.svg import bars_svg, histogram_svg, points_svg
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 from benchmark.growth import Timing, fitted_exponent, growth_table, looped_scene, timed_rotation_averaging
-from paper.svg import growth_svg
+from paper.plots import bars_svg, growth_svg, histogram_svg, points_svg
 
 
 def test_exponents_are_those_that_the_times_were_made_with():
@@ -15,12 +15,32 @@ def test_exponents_are_those_that_the_times_were_made_with():
     assert "| a | 10: 0.60, 100: 11.94, 700: 149.88 | 1.30 |" in growth_table({"a": timings}, "images")
 
 
-def test_plots_hold_every_series_once():
+def test_plots_hold_every_series_and_are_the_same_each_time():
     sizes = np.array([10.0, 100.0, 1000.0])
-    root = ET.fromstring(growth_svg("t < u", "images", {"one": (sizes, sizes / 7), "two": (sizes, sizes**2 / 1e4)}))
-    names = [child.tag.split("}")[1] for child in root]
-    assert names.count("polyline") == 2
-    assert names.count("circle") == 6
+    series = {"one": (sizes, sizes / 7), "two": (sizes, sizes**2 / 1e4)}
+    drawn = growth_svg("t < u", "images", series)
+    root = ET.fromstring(drawn)
+    texts = {element.text for element in root.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"t < u", "images", "seconds", "one", "two"} <= texts
+    markers = [e for e in root.iter("{http://www.w3.org/2000/svg}use") if "fill: #" in e.get("style", "")]
+    assert len(markers) == 2 * (len(sizes) + 1)  # and one each in the legend
+    assert growth_svg("t < u", "images", series) == drawn
+
+
+@pytest.mark.parametrize(
+    ("drawn", "texts"),
+    [
+        (
+            histogram_svg("h", "degrees", np.arange(4.0), {"before": np.array([0, 10, 1]), "after": np.ones(3)}),
+            {"edges"},
+        ),
+        (bars_svg("b", "share", {"1C": 0.25, "2O": 0.5}), {"25 %", "50 %", "2O"}),
+        (points_svg("p", np.array([[0, 1]]), np.eye(2), {"CLS": np.zeros((2, 2))}), {"truth", "CLS"}),
+    ],
+)
+def test_figures_say_what_they_show(drawn, texts):
+    found = {element.text for element in ET.fromstring(drawn).iter("{http://www.w3.org/2000/svg}text")}
+    assert texts <= found
 
 
 def test_looped_scenes_have_their_edges_and_loops():

@@ -1,0 +1,105 @@
+"""Figures as SVG text: histograms, bars, points of a graph, growth."""
+
+import io
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.errors import ColmapVgError
+
+try:
+    import matplotlib as mpl
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+except ImportError as error:
+    raise ColmapVgError('figures need matplotlib: pip install "colmap-vg[plots]"') from error
+
+Array = NDArray[np.float64]
+
+SIZE_INCHES = (5.0, 2.7)
+STYLE = {
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "colmap_vg",  # the same figure has the same bytes
+    "font.size": 8.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    # Okabe and Ito's colours, which colour-blind readers tell apart.
+    "axes.prop_cycle": mpl.cycler(
+        color=["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#000000"]
+    ),
+}
+
+
+def histogram_svg(title: str, label: str, bins: Array, counts: Mapping[str, Array]) -> str:
+    """Histograms over the same bins, as outlines; counts on a logarithmic axis.
+
+    Parameters
+    ----------
+    title, label : str
+        `label` is the horizontal axis's.
+    bins : (k + 1,) array
+        Edges of the bins.
+    counts : mapping of name to (k,) array
+    """
+    with mpl.rc_context(STYLE):
+        figure, axes = _empty(title)
+        for name, values in counts.items():
+            axes.stairs(np.maximum(values, 0.5), bins, baseline=0.5, fill=True, alpha=0.3, label=name)
+        axes.set(xlabel=label, ylabel="edges", yscale="log", ylim=(0.5, None))
+        axes.legend(frameon=False)
+        return _text_of(figure)
+
+
+def bars_svg(title: str, label: str, shares: Mapping[str, float]) -> str:
+    """A bar for each name, from 0 to 1, with its percentage."""
+    with mpl.rc_context(STYLE):
+        figure, axes = _empty(title)
+        bars = axes.bar(list(shares), list(shares.values()), width=0.7)
+        axes.bar_label(bars, [f"{100 * share:.3g} %" for share in shares.values()])
+        axes.set(ylabel=label, ylim=(0.0, 1.1))
+        return _text_of(figure)
+
+
+def points_svg(title: str, edges: NDArray[np.int64], truth: Array, points: Mapping[str, Array]) -> str:
+    """A plane graph and other placements of its vertices: `truth` and each of `points` are (n, 2)."""
+    with mpl.rc_context(STYLE):
+        figure, axes = _empty(title)
+        axes.plot(*np.moveaxis(truth[edges], 2, 0).swapaxes(1, 2), color="#bbbbbb", linewidth=0.8)
+        for name, centers in {"truth": truth, **points}.items():
+            axes.plot(*centers.T, marker="o", linestyle="none", fillstyle="none", label=name)
+        axes.set(aspect="equal", xticks=[], yticks=[])
+        axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return _text_of(figure)
+
+
+def growth_svg(title: str, label: str, series: Mapping[str, tuple[Array, Array]]) -> str:
+    """Lines of seconds over sizes, both axes logarithmic.
+
+    Parameters
+    ----------
+    title, label : str
+        `label` is the horizontal axis's.
+    series : mapping of name to ((k,) sizes, (k,) seconds)
+    """
+    with mpl.rc_context(STYLE):
+        figure, axes = _empty(title)
+        for name, (sizes, seconds) in series.items():
+            axes.loglog(sizes, seconds, marker="o", markersize=3, label=name)
+        axes.set(xlabel=label, ylabel="seconds")
+        axes.legend(frameon=False)
+        return _text_of(figure)
+
+
+def _empty(title: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=SIZE_INCHES, layout="constrained")
+    axes = figure.subplots()
+    axes.set_title(title)
+    axes.set_prop_cycle(STYLE["axes.prop_cycle"])
+    return figure, axes
+
+
+def _text_of(figure: Figure) -> str:
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()
