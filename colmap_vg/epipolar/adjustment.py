@@ -17,7 +17,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_equations
+from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_equations, depth_residuals
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem
 from colmap_vg.errors import GraphError
@@ -26,6 +26,7 @@ from colmap_vg.geometry.directions import normalized
 from colmap_vg.linear.robust_losses import MAD_TO_SIGMA
 from colmap_vg.scene.solution import LogEntry
 from colmap_vg.two_view.sampson import cauchy_costs, frames, median_errors, normal_equations, residuals
+from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -230,10 +231,22 @@ def _in_stages(
 
 
 def edge_errors(problem: EpipolarProblem, found: AdjustmentResult) -> Array:
-    """Median Sampson error of each edge's matches at adjusted cameras, pixels: (m,)."""
+    """How far the matches of each edge are from adjusted cameras, pixels: (m,).
+
+    The median Sampson error or, where it is larger, the median disagreement on depths in the best of the edge's
+    triplets: matches along their epipolar lines, as those of a façade that repeats itself, show in depth alone.
+    """
     cameras = Cameras(found.cam_from_world_rotations, found.projection_centers, np.log(found.focal_scales))
     R, d, _ = cameras.relative(problem.edges)
-    return median_errors(problem.matches(cameras.log_scales), R, d)
+    errors = median_errors(problem.matches(cameras.log_scales), R, d)
+    triplets = problem.triplets
+    if triplets is None:
+        return errors
+    rays = problem.triplet_rays(triplets, cameras.log_scales)
+    medians = segment_quantiles(triplets.offsets, np.abs(depth_residuals(rays, cameras.about_middle(triplets.images))))
+    best = np.full(len(errors), np.inf)
+    np.minimum.at(best, triplets.edges.ravel(), np.repeat(medians, 2))
+    return np.asarray(np.maximum(errors, np.where(np.isfinite(best), best, 0.0)))
 
 
 def _sigma(problem: EpipolarProblem, cameras: Cameras) -> float:

@@ -16,7 +16,7 @@ def some_job(reporter: Reporter) -> None:
     log = StageLog(reporter.on_event)
     with log.stage("features"):
         log.progress("1 of 2", 0.5)
-        log.warn("skipped a[0].jpg: the file is empty")
+        log.warn("skipped a[red].jpg: the file is empty")
         log.result("12 features")
     with log.stage("matching"):
         pass
@@ -33,7 +33,7 @@ def shown(capsys: pytest.CaptureFixture[str], quiet: bool = False, verbose: bool
 def test_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
     _, lines = shown(capsys)
     assert lines == [
-        "warning: skipped a[0].jpg: the file is empty",
+        "warning: skipped a[red].jpg: the file is empty",
         "features: 12 features (0.0 s)",
         "matching: done (0.0 s)",
     ]
@@ -48,7 +48,7 @@ def test_quiet_shows_nothing_and_keeps_everything(capsys: pytest.CaptureFixture[
     reporter, lines = shown(capsys, quiet=True)
     assert lines == []
     assert [record.stage for record in reporter.records] == ["features", "matching"]
-    assert reporter.warnings == ["skipped a[0].jpg: the file is empty"]
+    assert reporter.warnings == ["skipped a[red].jpg: the file is empty"]
 
 
 def test_a_terminal_gets_lines_with_brackets_unharmed(
@@ -56,7 +56,7 @@ def test_a_terminal_gets_lines_with_brackets_unharmed(
 ) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     _, lines = shown(capsys)
-    assert any("a[0].jpg" in line for line in lines)
+    assert any("a[red].jpg" in line for line in lines)
 
 
 def test_summary_is_plain_json(tmp_path: Path) -> None:

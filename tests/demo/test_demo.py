@@ -1,6 +1,7 @@
 """The rendered photographs show what the cameras they claim would see; the demo ends with the truth."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 from colmap_vg.cli.main import app
 from colmap_vg.demo.photographs import camera_ring, render_photographs, true_camera, write_truth
 from colmap_vg.demo.render import RayCaster, pixel_rays
-from colmap_vg.demo.scene import build_ruin
+from colmap_vg.demo.scene import _arch, _columns, _rubble, _walls, build_ruin
 from colmap_vg.demo.texture import paint
 
 
@@ -22,12 +23,20 @@ def caster() -> RayCaster:
     return RayCaster(paint(build_ruin(rng), rng, texels_per_metre=60.0))
 
 
-def test_faces_are_planar_and_look_outwards() -> None:
+def test_faces_are_planar_and_the_ground_looks_up() -> None:
     scene = build_ruin(np.random.default_rng(0))
     normals = scene.normals()
     heights = np.einsum("qa,qka->qk", normals, scene.quads - scene.quads[:, :1])
     assert np.abs(heights).max() < 1e-9
     assert normals[0] @ [0, 0, 1] == pytest.approx(1.0)  # the ground
+
+
+@pytest.mark.parametrize("part", [_walls, _columns, _arch, _rubble])
+def test_faces_of_solids_look_away_from_their_middle(part: Callable[..., list[tuple[np.ndarray, int]]]) -> None:
+    for quads, _ in part(np.random.default_rng(0)):
+        normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
+        outwards = quads.mean(axis=1) - quads.mean(axis=(0, 1))
+        assert (np.einsum("qa,qa->q", normals, outwards) > 0).all()
 
 
 def test_faces_have_texture_of_their_own() -> None:

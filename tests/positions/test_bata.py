@@ -37,13 +37,20 @@ def test_result_is_a_minimum_of_the_robust_sines(seed):
             assert abs(up - down) < 1e-3 * (up + down - 2.0 * result.cost), "the lowest point of a parabola"
 
 
-def test_long_and_short_baselines_weigh_the_same():
-    # An edge's cost depends on its angle alone: CLS, from the same directions, is drawn by the long ones.
-    problem = ring_problem(20, 6, direction_sigma=0.05, seed=2)
-    a = solve_bata(*problem.measured)
-    lengths = np.linalg.norm(np.diff(a.projection_centers[problem.edges], axis=1)[:, 0], axis=1)
-    inside = np.isfinite(a.lambdas)
-    assert np.abs(a.lambdas[inside] / lengths[inside] - 1.0).max() < 0.1
+@pytest.mark.parametrize("seed", range(3))
+def test_long_baselines_do_not_draw_the_others(seed):
+    # An edge counts by its angle alone; CLS fits the long ones at the cost of the short ones.
+    problem = ring_problem(40, 10, direction_sigma=0.03, seed=seed)
+
+    def long_over_short(p):
+        d = p[problem.edges[:, 1]] - p[problem.edges[:, 0]]
+        length = np.linalg.norm(d, axis=1)
+        squared = np.sum((d / length[:, None] - problem.directions) ** 2, axis=1)
+        long = length > np.median(length)
+        return np.sqrt(squared[long].mean() / squared[~long].mean())
+
+    assert long_over_short(solve_cls(*problem.measured).projection_centers) < 0.8
+    assert long_over_short(solve_bata(*problem.measured).projection_centers) > 1.0
 
 
 def test_outliers_are_outvoted():

@@ -130,7 +130,7 @@ def test_same_bits_twice_and_disconnected_refused():
 
 @pytest.mark.real_data
 def test_ellis_island(data_folder):
-    """Median and mean rotation error below pycolmap.run_rotation_averaging's on the same cameras (0.56, 2.75 deg)."""
+    """Beside pycolmap.run_rotation_averaging on the same cameras: median below 0.56°, mean within 5 % of 2.75°."""
     data = scipy.io.loadmat(data_folder / "view_graphs" / "rotations" / "ellis_island.mat")
     edges = data["I"].astype(np.int64).T - 1
     relative, truth = so3.project(np.moveaxis(data["RR"], 2, 0)), np.moveaxis(data["Rgt"], 2, 0)
@@ -139,4 +139,4 @@ def test_ellis_island(data_folder):
     assert known.sum() == 227
     errors = np.degrees(_errors(result.cam_from_world_rotations[known], truth[known]))
     assert np.median(errors) < 0.56
-    assert errors.mean() < 3.0
+    assert errors.mean() < 1.05 * 2.75
