@@ -52,7 +52,8 @@ def extract_colors(
             continue
         seen = image.get_observation_points2D()
         rows = np.searchsorted(ids, np.array([point.point3D_id for point in seen], dtype=np.uint64))
-        total[rows] += interpolated(pixels, np.array([point.xy for point in seen]).reshape(-1, 2) * scale)
+        seen_colors = interpolated(pixels, np.array([point.xy for point in seen]).reshape(-1, 2) * scale)
+        total[rows] += seen_colors[:, ::-1]
         count[rows] += 1.0
     _warn(missing, f"are not in {folder}, or cannot be read", reconstruction, log)
     _warn(unlike, f"have other proportions than the files in {folder}", reconstruction, log)
@@ -85,17 +86,17 @@ def interpolated(pixels: NDArray[np.uint8], points: Array) -> Array:
 
 
 def _read(path: Path) -> NDArray[np.uint8] | None:
-    """Red, green and blue as stored, before any EXIF orientation; None where there is no picture."""
+    """Blue, green and red as stored, before any EXIF orientation; None where there is no picture."""
     try:
         pixels = decoded(path.read_bytes())
     except OSError:
         return None
     if pixels is None:
         return None
-    pixels = np.atleast_3d(pixels)
-    pixels = np.repeat(pixels[:, :, :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[:, :, 2::-1]
-    eight_bits = (stretched(pixels) >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels.astype(np.uint8)
-    return np.ascontiguousarray(eight_bits)
+    if pixels.dtype == np.uint16:
+        pixels = stretched(pixels) >> 8
+    pixels = np.atleast_3d(pixels)[:, :, :3].astype(np.uint8, copy=False)
+    return np.broadcast_to(pixels[:, :, :1], (*pixels.shape[:2], 3)) if pixels.shape[2] < 3 else pixels
 
 
 def _warn(names: list[str], why: str, reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
