@@ -18,6 +18,7 @@ from colmap_vg.mapping.pair_agreement import PairRotations, agreeing_pairs
 from colmap_vg.mapping.visibility import NEAR_DEG, in_frame, sampled_tracks
 from colmap_vg.scene.components import components_by_size
 from colmap_vg.scene.normalized_cut import normalized_cut
+from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -187,16 +188,17 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     were_compared = np.zeros((n, n), dtype=bool)
     were_compared[rows[:, 0], rows[:, 1]] = were_compared[rows[:, 1], rows[:, 0]] = True
     tracks = sampled_tracks(reconstruction, ids, MAX_NUM_POINTS)
-    visible = in_frame(reconstruction, ids, tracks.points)
+    point_of_sight, looking = np.nonzero(in_frame(reconstruction, ids, tracks.points))
+    sights = np.concatenate([[0], np.cumsum(np.bincount(point_of_sight, minlength=len(tracks.points)))])
+    seen_point, seeing = np.nonzero(tracks.sees)
+    # Each image that sees a point beside each that it lies in the frame of.
+    rows, offsets = rows_of_segments(sights.astype(np.int64), seen_point)
+    beside = segment_of_rows(offsets)
+    point, image, near = point_of_sight[rows], looking[rows], seeing[beside]
     centers = np.array([reconstruction.image(i).projection_center() for i in ids])
-    parts = []
-    for row, point in enumerate(tracks.points):
-        own, others = np.flatnonzero(tracks.sees[row]), np.flatnonzero(visible[row])
-        distance = np.linalg.norm(centers - point, axis=1)
-        rays = normalized(centers - point)
-        near = were_compared[others][:, own] & (rays[others] @ rays[own].T >= np.cos(np.radians(NEAR_DEG)))
-        near &= np.abs(np.log(distance[others][:, None] / distance[own])) <= np.log(MAX_DISTANCE_RATIO)
-        j, i = np.nonzero(near)
-        parts.append(np.stack([np.full(len(j), row), others[j], own[i], tracks.sees[row, others[j]]]))
-    points, images, nears, seen = np.concatenate([np.zeros((4, 0), dtype=np.int64), *parts], axis=1)
-    return _Expected(points, images, nears, seen.astype(bool))
+    to_image, to_near = centers[image] - tracks.points[point], centers[near] - tracks.points[point]
+    farther = np.log(np.linalg.norm(to_image, axis=1) / np.linalg.norm(to_near, axis=1))
+    cosine = np.einsum("ka,ka->k", normalized(to_image), normalized(to_near))
+    expected = (cosine >= np.cos(np.radians(NEAR_DEG))) & (np.abs(farther) <= np.log(MAX_DISTANCE_RATIO))
+    expected &= were_compared[image, near]
+    return _Expected(point[expected], image[expected], near[expected], tracks.sees[point, image][expected])
