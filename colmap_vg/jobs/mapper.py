@@ -33,6 +33,7 @@ from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, po
 from colmap_vg.mapping.weak_cuts import WeakCut, cut_along, weak_cuts
 from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.reading.read import read_with_caveats
+from colmap_vg.scene.edge_residuals import graph_residual_sigmas
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.scene.view_graph import ViewGraph
@@ -59,7 +60,8 @@ class MappingResult:
         As written, the largest first.
     graph : ViewGraph
     solution : PoseSolution
-        With the poses, focal factors and image verdicts of the finished model, in its frame; the rest as solved.
+        With the poses, focal factors, image verdicts, agreement and residuals of the finished models, in their frames;
+        edge verdicts, radial terms and covariances as solved.
     weak_cuts : tuple of tuples of WeakCut
         Of each model: where few pairs hold it together, and what its points say of that.
     """
@@ -448,6 +450,7 @@ def _as_in_models(
         image_verdicts=words.astype(str),
         status=status,
         message=message,
+        edge_residual_sigmas=graph_residual_sigmas(graph, rotations, centers, component),
         agreement=agreement,
         in_doubt=in_doubt,
     )

@@ -57,7 +57,7 @@ class ImageRow:
 class PairRow:
     """A verified pair of a finished job; errors are empty where its images do not share a model.
 
-    `sigmas` is the error in standard deviations of the pair's own matches, against the viewing graph's solution.
+    `sigmas` is the error in standard deviations of the pair's own matches.
     """
 
     image1: str

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
+from colmap_vg.scene.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -65,3 +66,36 @@ def edge_residual_sigmas(
     tilt = across * (angle / np.maximum(sine, np.finfo(float).tiny))[:, None]
     residual = np.concatenate([turn, tilt], axis=1)
     return np.asarray(np.sqrt(np.einsum("ka,kab,kb->k", residual, information, residual) / 5.0))
+
+
+def graph_residual_sigmas(graph: ViewGraph, rotations: Array, centers: Array, component: IntArray) -> Array | None:
+    """Residuals of all edges of a graph against poses, as :func:`edge_residual_sigmas` has them.
+
+    Parameters
+    ----------
+    graph : ViewGraph
+    rotations : (n, 3, 3) array
+        cam_from_world.
+    centers : (n, 3) array
+    component : (n,) int array
+        Images of one frame have one number; -1 is none.
+
+    Returns
+    -------
+    (m,) array or None
+        NaN for edges between frames and those without a direction; None for graphs without information.
+    """
+    if graph.edge_information is None:
+        return None
+    ends = component[graph.edges]
+    rows = np.flatnonzero((ends[:, 0] >= 0) & (ends[:, 0] == ends[:, 1]) & graph.has_direction)
+    sigmas = np.full(graph.num_edges, np.nan)
+    sigmas[rows] = edge_residual_sigmas(
+        graph.edges[rows],
+        graph.cam2_from_cam1_rotations[rows],
+        graph.cam2_in_cam1_directions[rows],
+        graph.edge_information[rows],
+        rotations,
+        centers,
+    )
+    return sigmas

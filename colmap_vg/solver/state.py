@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
 from colmap_vg.scene.components import components_by_size
-from colmap_vg.scene.edge_residuals import edge_residual_sigmas
+from colmap_vg.scene.edge_residuals import graph_residual_sigmas
 from colmap_vg.scene.solution import Agreement, LogEntry, PoseSolution
 from colmap_vg.scene.subgraph import Subgraph
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
@@ -207,27 +207,12 @@ class SolverState:
             caveats=tuple(self.caveats),
             position_covariances=None if self._covariances is None else self._covariances[0],
             rotation_covariances=None if self._covariances is None else self._covariances[1],
-            edge_residual_sigmas=self._edge_residual_sigmas(inside),
+            edge_residual_sigmas=graph_residual_sigmas(self.graph, self._R, self._p, component),
             agreement=agreement,
             in_doubt=self._in_doubt if in_doubt else None,
             arrangements=tuple(self._arrangements),
             log=tuple(self.log),
         )
-
-    def _edge_residual_sigmas(self, inside: BoolArray) -> Array | None:
-        graph = self.graph
-        if graph.edge_information is None:
-            return None
-        sigmas, rows = np.full(graph.num_edges, np.nan), np.flatnonzero(inside & graph.has_direction)
-        sigmas[rows] = edge_residual_sigmas(
-            graph.edges[rows],
-            graph.cam2_from_cam1_rotations[rows],
-            graph.cam2_in_cam1_directions[rows],
-            graph.edge_information[rows],
-            self._R,
-            self._p,
-        )
-        return sigmas
 
 
 def described(

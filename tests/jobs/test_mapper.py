@@ -23,6 +23,7 @@ from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.jobs import mapper
 from colmap_vg.jobs.mapper import MappingResult, map_database, view_graph_mapping
 from colmap_vg.options import MappingOptions
+from colmap_vg.scene.edge_residuals import edge_residual_sigmas
 from colmap_vg.scene.solution import SolutionStatus
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict
 from colmap_vg.solver.solve import solve_view_graph
@@ -84,6 +85,17 @@ def test_the_solution_is_the_finished_models(noisy: tuple[Path, pycolmap.Reconst
     assert solution.status == SolutionStatus.SOLVED
     focal = model.camera(1).mean_focal_length()
     assert solution.focal_scales * graph.camera_focal_lengths == pytest.approx(focal, rel=1e-12)
+    rotations = np.array([model.image(i).cam_from_world().rotation.matrix() for i in solution.image_ids.tolist()])
+    sigmas = edge_residual_sigmas(
+        graph.edges,
+        graph.cam2_from_cam1_rotations,
+        graph.cam2_in_cam1_directions,
+        graph.edge_information,
+        rotations,
+        centers(model, solution.image_ids.tolist()),
+    )
+    assert np.allclose(solution.edge_residual_sigmas, sigmas, rtol=1e-6)
+    assert 0.3 < np.median(sigmas) < 3.0
 
 
 def test_the_frame_and_scale_are_sane(noisy: tuple[Path, pycolmap.Reconstruction], tmp_path: Path) -> None:
