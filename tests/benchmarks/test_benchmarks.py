@@ -1,4 +1,4 @@
-"""Times of the steps from database to solution: ``pytest tests/benchmarks --benchmark-only``; plain pytest skips them.
+"""Times of single steps: ``pytest tests/benchmarks --benchmark-only -n 0``; plain pytest skips them.
 
 Problems are of fixed size and seed, so that two runs on one machine compare. Ratios between releases are what counts.
 """
