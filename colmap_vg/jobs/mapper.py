@@ -207,7 +207,8 @@ def _build(
             count = int((solution.component == component).sum())
             log.warn(f"{count} images that seemed a model of their own share no points that could fix them.")
     if len(models) > 1:
-        models = _joined(cache, models, graph, pairs, compared_pairs(database_path), options, log)
+        usable = ~np.isin(solution.edge_verdicts, FALSE_PAIRS)
+        models = _joined(cache, models, graph, usable, pairs, _compared(database_path, graph), options, log)
     if models and replaced:
         with (
             log.stage("cameras"),
@@ -224,6 +225,7 @@ def _joined(
     cache: "pycolmap.DatabaseCache",
     models: list[_Model],
     graph: ViewGraph,
+    usable: NDArray[np.bool_],
     pairs: PairRotations,
     compared: NDArray[np.int64],
     options: MappingOptions,
@@ -234,7 +236,7 @@ def _joined(
     while True:
         with log.stage("join"):
             models = sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
-            first, second, joint = _best_joint(models, graph, refused, options.random_seed)
+            first, second, joint = _best_joint(models, graph, usable, refused, options.random_seed)
             if joint.similarity is None:
                 log.result("one model" if len(models) == 1 else f"{len(models)} models, no two of which share points")
                 return models
@@ -262,8 +264,22 @@ def _joined(
         )
 
 
+def _compared(database_path: str | PathLike[str], graph: ViewGraph) -> NDArray[np.int64]:
+    """Ids of images (k, 2) that were compared, without the pairs that the user excluded: their matches are not used."""
+    pairs = np.sort(compared_pairs(database_path), axis=1)
+    if graph.read_verdicts is None:
+        return pairs
+    excluded = np.sort(graph.image_ids[graph.edges[graph.read_verdicts == EdgeVerdict.EXCLUDED]], axis=1)
+    known = set(map(tuple, excluded.tolist()))
+    return np.array([pair for pair in pairs.tolist() if tuple(pair) not in known], dtype=np.int64).reshape(-1, 2)
+
+
 def _best_joint(
-    models: Sequence[_Model], graph: ViewGraph, refused: set[frozenset[int]], seed: int
+    models: Sequence[_Model],
+    graph: ViewGraph,
+    usable: NDArray[np.bool_],
+    refused: set[frozenset[int]],
+    seed: int,
 ) -> tuple[int, int, Joint]:
     """The two models that most shared points join; a joint without a similarity where there are none."""
     best = 0, 0, Joint(0, 0, None)
@@ -272,7 +288,7 @@ def _best_joint(
             own, other = one.reconstruction, models[b].reconstruction
             if frozenset(own.reg_image_ids()) | frozenset(other.reg_image_ids()) in refused:
                 continue
-            joint = joint_of(own, other, graph, seed)
+            joint = joint_of(own, other, graph, usable, seed)
             if joint.similarity is not None and joint.num_agreeing > best[2].num_agreeing:
                 best = a, b, joint
     return best
@@ -395,7 +411,7 @@ def _weak_cuts(
 ) -> tuple[tuple[WeakCut, ...], ...]:
     """Of each model, where few pairs hold it together; with a warning where its points speak against them."""
     with log.stage("check"):
-        compared, pairs = compared_pairs(database_path), _pair_rotations(graph)
+        compared, pairs = _compared(database_path, graph), _pair_rotations(graph)
         found = tuple(weak_cuts(model.reconstruction, pairs, compared) for model in models)
         for model, cuts in zip(models, found, strict=True):
             for cut in cuts:

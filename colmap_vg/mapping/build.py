@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.events import StageLog
 from colmap_vg.mapping.bundle import adjust_bundle
-from colmap_vg.mapping.lenses import tame_lenses
+from colmap_vg.mapping.lenses import reset_diverged_lenses
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
     MIN_TRIANGULATION_ANGLE_DEG,
@@ -119,7 +119,7 @@ def build_model(
             again = _remove_unsupported(mapper)
             removed, added = removed | again, added - again
         log.result(f"{len(added)} images added, {len(removed)} removed")
-        tame_lenses(
+        reset_diverged_lenses(
             reconstruction,
             cache,
             options,

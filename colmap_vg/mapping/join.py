@@ -13,6 +13,7 @@ from colmap_vg.scene.view_graph import ViewGraph
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 MIN_AGREEING = 10
 """Points that agree on a similarity in both images; three fix it, and one does so by chance in 10^4."""
@@ -41,7 +42,11 @@ class Joint:
 
 
 def joint_of(
-    own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction", graph: ViewGraph, seed: int = 0
+    own: "pycolmap.Reconstruction",
+    other: "pycolmap.Reconstruction",
+    graph: ViewGraph,
+    usable: BoolArray,
+    seed: int = 0,
 ) -> Joint:
     """Find the similarity between two models from the points that verified matches identify.
 
@@ -51,13 +56,15 @@ def joint_of(
         Of the same database, with points, without a common image.
     graph : ViewGraph
         With the keypoints of the matches of all pairs.
+    usable : (m,) bool array
+        Edges of the graph whose matches may identify points.
     seed : int
 
     Returns
     -------
     Joint
     """
-    identified = list(_identified(own, other, graph))
+    identified = list(_identified(own, other, graph, usable))
     if not identified:
         return Joint(0, 0, None)
     rows = np.concatenate(identified)
@@ -69,7 +76,7 @@ def joint_of(
     )
     similarity, agree = similarity_of_points(*points, seed)
     count = int(agree.sum())
-    firm = count >= max(MIN_AGREEING, MIN_SHARE_AGREEING * len(rows)) and _spread(points[0].points[agree])
+    firm = count >= max(MIN_AGREEING, MIN_SHARE_AGREEING * len(rows)) and is_spread(points[0].points[agree])
     return Joint(len(rows), count, similarity if firm else None)
 
 
@@ -108,13 +115,14 @@ def joined_poses(
     return empty
 
 
-def _spread(points: Array) -> bool:
+def is_spread(points: Array) -> bool:
+    """Whether points (k, 3) fix a similarity: they are not along one line."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(singular[1] >= MIN_FLATNESS * singular[0])
 
 
 def _identified(
-    own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction", graph: ViewGraph
+    own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction", graph: ViewGraph, usable: BoolArray
 ) -> Iterator[IntArray]:
     """Rows (point of own, of other, image of own, of other, keypoint in it, in the other) of each pair between them."""
     offsets, keypoints1, keypoints2 = graph.inlier_offsets, graph.inlier_keypoints1, graph.inlier_keypoints2
@@ -123,7 +131,7 @@ def _identified(
     ids = graph.image_ids[graph.edges]
     sides = [np.isin(ids, sorted(model.reg_image_ids())) for model in (own, other)]
     points: dict[int, IntArray] = {}
-    for edge in np.flatnonzero((sides[0] & sides[1][:, ::-1]).any(axis=1)).tolist():
+    for edge in np.flatnonzero(usable & (sides[0] & sides[1][:, ::-1]).any(axis=1)).tolist():
         rows = slice(*offsets[edge : edge + 2].tolist())
         matches, images = np.stack([keypoints1[rows], keypoints2[rows]], axis=1).astype(np.int64), ids[edge]
         if not sides[0][edge, 0]:

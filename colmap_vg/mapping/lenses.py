@@ -1,4 +1,4 @@
-"""Lenses whose coefficients the photographs do not tell: they make up for each other, and run away."""
+"""Distortion coefficients that the images do not determine, and that diverged in bundle adjustment."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,56 +22,59 @@ _SIMPLER: dict[str, tuple[str, tuple[tuple[int, ...], ...]]] = {
 """The same model with fewer coefficients, and which of the full model's parameters each of its own is."""
 
 
-def tame_lenses(
+def reset_diverged_lenses(
     reconstruction: "pycolmap.Reconstruction",
     cache: "pycolmap.DatabaseCache",
     options: MappingOptions,
     log: StageLog,
     adjust: Callable[[MappingOptions], object],
 ) -> None:
-    """Take coefficients back that ran away, adjust again, and warn of them.
+    """Reset distortion coefficients that diverged, adjust again, and warn of them.
 
-    Lenses with given coefficients keep these as they came. Others are adjusted under a simpler model, from no
-    distortion on, and have their own model again afterwards, the higher coefficients 0.
+    Given coefficients are reset to their initial values. Lenses that started without distortion are adjusted under a
+    simpler model, and get their own model back afterwards, with its higher coefficients 0.
 
     Parameters
     ----------
     reconstruction : pycolmap.Reconstruction
         Adjusted, with points.
     cache : pycolmap.DatabaseCache
-        With the cameras as they came.
+        With the initial cameras.
     options : MappingOptions
     log : StageLog
     adjust : callable
         Bundle adjustment of the reconstruction under options.
     """
-    wild = _wild(reconstruction) if options.ba_refine_extra_params else []
-    given = [i for i in wild if any(cache.camera(i).params[k] for k in cache.camera(i).extra_params_idxs())]
-    for camera_id in given:
-        lens, came = reconstruction.camera(camera_id), cache.camera(camera_id).params
-        lens.params = [came[k] if k in lens.extra_params_idxs() else p for k, p in enumerate(lens.params)]
-    if given:
-        log.warn(f"The photographs do not tell {_coefficients(reconstruction, given)}; they are kept as they came.")
-        adjust(replace(options, ba_refine_extra_params=False))
-    simple = [i for i in wild if i not in given and _has_simpler_model(reconstruction.camera(i))]
+    diverged = _diverged(reconstruction) if options.ba_refine_extra_params else []
+    given = [i for i in diverged if any(cache.camera(i).params[k] for k in cache.camera(i).extra_params_idxs())]
+    simple = [i for i in diverged if i not in given and _has_simpler_model(reconstruction.camera(i))]
     if simple:
-        log.warn(f"The photographs do not tell the higher of {_coefficients(reconstruction, simple)}; they are 0.")
+        told = _coefficients(reconstruction, simple)
+        log.warn(f"The images do not determine the higher ones of {told}; they are set to 0.")
         models = [_simplify(reconstruction.camera(i)) for i in simple]
         adjust(options)
         for camera_id, (model, size) in zip(simple, models, strict=True):
             _restore(reconstruction.camera(camera_id), model, size)
-    _warn_of_wild(reconstruction, log)
+    # Last: no coefficient is refined any more.
+    for camera_id in given:
+        lens, initial = reconstruction.camera(camera_id), cache.camera(camera_id).params
+        lens.params = [initial[k] if k in lens.extra_params_idxs() else p for k, p in enumerate(lens.params)]
+    if given:
+        told = _coefficients(reconstruction, given)
+        log.warn(f"The images do not determine {told}; they are kept at their initial values.")
+        adjust(replace(options, ba_refine_extra_params=False))
+    _warn_of_diverged(reconstruction, log)
 
 
-def _warn_of_wild(reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
+def _warn_of_diverged(reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
     """Warn of lenses whose coefficients are no real lens's."""
-    wild = _wild(reconstruction)
-    if wild:
+    diverged = _diverged(reconstruction)
+    if diverged:
+        largest = max(_largest_coefficient(reconstruction.camera(i)) for i in diverged)
         log.warn(
-            f"{_coefficients(reconstruction, wild).capitalize()} are up to"
-            f" {max(_largest_coefficient(reconstruction.camera(i)) for i in wild):.3g}, which the photographs do not"
-            " tell: they hold inside the images only. Use a simpler camera model, or keep the coefficients"
-            " (ba_refine_extra_params)."
+            f"The images do not determine {_coefficients(reconstruction, diverged)}, which reach {largest:.3g}: the"
+            " lens is valid inside the images only. Choose a camera model with fewer coefficients, or do not refine"
+            " them (ba_refine_extra_params)."
         )
 
 
@@ -100,7 +103,7 @@ def _restore(lens: "pycolmap.Camera", own: str, size: int) -> None:
     lens.model, lens.params = getattr(pycolmap.CameraModelId, own), [found.get(k, 0.0) for k in range(size)]
 
 
-def _wild(reconstruction: "pycolmap.Reconstruction") -> list[int]:
+def _diverged(reconstruction: "pycolmap.Reconstruction") -> list[int]:
     """Ids of cameras of registered images whose coefficients are no real lens's."""
     used = sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()})
     return [i for i in used if _largest_coefficient(reconstruction.camera(i)) > MAX_SANE_COEFFICIENT]
@@ -113,4 +116,4 @@ def _largest_coefficient(lens: "pycolmap.Camera") -> float:
 def _coefficients(reconstruction: "pycolmap.Reconstruction", camera_ids: list[int]) -> str:
     others = f" and {len(camera_ids) - 1} more" if len(camera_ids) > 1 else ""
     name = reconstruction.camera(camera_ids[0]).model_name
-    return f"the coefficients of the {name} lens of camera {camera_ids[0]}{others}"
+    return f"the distortion coefficients of the {name} lens of camera {camera_ids[0]}{others}"

@@ -106,3 +106,8 @@ def test_links_need_tracks_in_front(monkeypatch):
     assert len(behind.edges) == 0
     monkeypatch.setattr(baseline_lengths, "MIN_TRACKS", 10**6)
     assert len(length_links(problem, relative, directions).edges) == 0
+
+
+def test_ratios_that_noise_swamps_are_not_firm() -> None:
+    links = LengthLinks(np.array([[0, 1], [1, 2], [2, 3]]), np.zeros(3), np.array([0.001, 0.09, 0.2]))
+    assert links.firm.tolist() == [True, True, False]

@@ -9,9 +9,18 @@ import pytest
 from linked_scenes import alike_streets, near, only_pairs, projection_centers, street, survey, write_scene
 from synthetic_databases import centers
 
-from colmap_vg import MappingOptions, align_positions, read_view_graph, solve_view_graph, view_graph_mapping
+from colmap_vg import (
+    MappingOptions,
+    ReadOptions,
+    SolutionStatus,
+    align_positions,
+    read_view_graph,
+    solve_view_graph,
+    view_graph_mapping,
+)
 from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
+from colmap_vg.jobs import mapper
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict
 
@@ -84,6 +93,24 @@ def test_parts_whose_only_link_is_a_turn_on_the_spot_are_joined_by_points(turn_d
     assert graph.read_verdicts[(graph.edges == [9, 10]).all(axis=1)] == EdgeVerdict.ROTATION_ONLY
     assert (solve_view_graph(graph).component == 1).sum() == 10
     check_one_model(tmp_path / "a.db", numbered(projection_centers(poses)), 0.002, tmp_path / "out")
+
+
+def test_pairs_that_the_user_excludes_join_nothing_and_are_not_missed(tmp_path: Path) -> None:
+    poses, points = street(20, 1)
+    write_scene(tmp_path / "a.db", poses, points, near(20, 3), seed=1)
+    across = [(i, j) for i, j in near(20, 3) if (i < 10) != (j < 10)]
+    for kept, count in (((9, 10), 1), (None, 2)):
+        listed = tmp_path / "excluded.txt"
+        listed.write_text("".join(f"{i:03d}.jpg {j:03d}.jpg\n" for i, j in across if (i, j) != kept))
+        options = MappingOptions(read=ReadOptions(excluded_pairs_path=listed))
+        log = StageLog()
+        result = map_database(tmp_path / "a.db", None, tmp_path / f"out{count}", options, log)
+        assert len(result.models) == count
+        assert not log.warnings
+        assert result.solution.status == (SolutionStatus.SOLVED if count == 1 else SolutionStatus.PARTIAL)
+        compared = {tuple(pair) for pair in mapper._compared(tmp_path / "a.db", result.graph).tolist()}
+        used = [pair for pair in near(20, 3) if pair not in across or pair == kept]
+        assert compared == {(i + 1, j + 1) for i, j in used}
 
 
 @pytest.mark.parametrize("alike", [0.2, 0.3])

@@ -5,6 +5,7 @@ import pytest
 
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.similarity import Similarity
+from colmap_vg.mapping.join import is_spread
 from colmap_vg.mapping.point_similarity import SeenPoints, similarity_of_points
 
 TRUE = Similarity(2.5, so3.exp(np.array([[0.3, -1.2, 0.7]]))[0], np.array([4.0, -1.0, 2.0]))
@@ -53,3 +54,10 @@ def test_fewer_than_three_points_tell_nothing() -> None:
     found, agree = similarity_of_points(own, other)
     assert found is None
     assert not agree.any()
+
+
+def test_points_along_a_line_do_not_join() -> None:
+    points = np.random.default_rng(0).standard_normal((50, 3))
+    assert is_spread(points)
+    assert is_spread(points * [1.0, 1.0, 0.0])
+    assert not is_spread(points * [1.0, 0.01, 0.01])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from linked_scenes import alike_streets, near, street, write_scene
+from linked_scenes import alike_streets, near, projection_centers, street, survey, write_scene
 
 from colmap_vg import MappingOptions, SolutionStatus
 from colmap_vg.events import StageLog
@@ -64,3 +64,14 @@ def test_one_street_with_few_links_is_not(seed: int, all_compared: bool, links: 
     assert bridge.num_pairs == links
     assert bridge.firm
     assert "is seen by both" in bridge.told
+
+
+def test_pairs_that_nobody_compared_are_not_missed(tmp_path: Path) -> None:
+    poses, points = survey(7, 6)
+    places = projection_centers(poses)
+    close = np.linalg.norm(places[:, None] - places[None], axis=2) < 2.3
+    pairs = [(i, j) for i, j in combinations(range(42), 2) if close[i, j] and (i < 21) == (j < 21)] + [(17, 24)]
+    write_scene(tmp_path / "a.db", poses, points, pairs)
+    result, warnings = mapped(tmp_path / "a.db", tmp_path / "out")
+    assert result.solution.status == SolutionStatus.SOLVED
+    assert not warnings

@@ -7,8 +7,10 @@ import pycolmap
 from synthetic_databases import centers, make_database, sha256
 
 from colmap_vg import MappingOptions, align_positions
+from colmap_vg.colmap_io.tables import read_tables
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.mapper import map_database
+from colmap_vg.reading.still_background import without_still_background
 
 NUM_STILL = 300
 
@@ -58,3 +60,11 @@ def test_the_object_is_reconstructed(tmp_path: Path) -> None:
     first = {i: models[0].image(i).num_points2D() - NUM_STILL for i in ids}
     seen = [(e.image_id, e.point2D_idx) for p in models[0].points3D.values() for e in p.track.elements]
     assert all(row < first[image] for image, row in seen)
+
+
+def test_ordinary_databases_are_left_alone(tmp_path: Path) -> None:
+    make_database(tmp_path / "a.db", num_images=6, num_points=100)
+    tables = read_tables(tmp_path / "a.db")
+    found, changed = without_still_background(tables, tmp_path / "a.db")
+    assert found is tables
+    assert not changed.any()
