@@ -4,24 +4,20 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import typer
 
 from colmap_vg._version import __version__
-from colmap_vg.cli import colmap_flags
+from colmap_vg.cli import colmap_flags, flags
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.cli.wording import with_flags
 from colmap_vg.errors import ColmapVgError, OptionError
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
-from colmap_vg.options import Matching as MatchingOption
-from colmap_vg.options import Method as SolverMethod
-from colmap_vg.options import Quality as QualityPreset
 
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of wrong usage, and of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
 
-METHODS = "|".join(get_args(SolverMethod))
 DEFAULTS = MappingOptions()
 
 app = typer.Typer(
@@ -33,163 +29,6 @@ app = typer.Typer(
     rich_markup_mode=None,  # its tables cut long flag names off
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-ImagePath = Annotated[Path, typer.Option("--image_path", help="Folder of photographs, searched recursively.")]
-MapperImagePath = Annotated[
-    Path | None, typer.Option("--image_path", help="Folder of the photographs. Without it, points have no colour.")
-]
-DatabasePath = Annotated[
-    Path, typer.Option("--database_path", help="COLMAP database with verified matches. It is never modified.")
-]
-OutputPath = Annotated[
-    Path, typer.Option("--output_path", help="Folder for models and summary. It is created if missing.")
-]
-CameraModel = Annotated[
-    str, typer.Option("--camera_model", help="COLMAP camera model of new cameras, such as PINHOLE or OPENCV.")
-]
-CameraParams = Annotated[
-    str,
-    typer.Option(
-        "--camera_params", metavar="F,CX,CY,...", help="Known calibration, in the order of the camera model, in pixels."
-    ),
-]
-CameraMode = Annotated[
-    str,
-    typer.Option(
-        "--camera_mode",
-        metavar="auto|single|per_folder|per_image",
-        help="Which images share a camera: all, those of a folder, or none.",
-    ),
-]
-Quality = Annotated[
-    str,
-    typer.Option(
-        "--quality",
-        metavar="|".join(get_args(QualityPreset)),
-        help="Preset of image size, number of features and pairs to match. Flags for these override it.",
-    ),
-]
-Matching = Annotated[
-    str | None,
-    typer.Option(
-        "--matching",
-        metavar="|".join(get_args(MatchingOption)),
-        help="Which pairs of images are matched. auto: all pairs up to 20 images, selected pairs beyond.",
-    ),
-]
-SequentialOverlap = Annotated[
-    int,
-    typer.Option(
-        "--sequential_overlap",
-        help="Number of following images that each image is matched with, in sequential matching.",
-    ),
-]
-ImageListPath = Annotated[
-    Path | None,
-    typer.Option("--image_list_path", help="Text file with one image name per line. Only these images are used."),
-]
-MaskPath = Annotated[
-    Path | None,
-    typer.Option(
-        "--mask_path",
-        help="Folder of masks, NAME.png or NAME.jpg for image NAME. No features are taken where a mask is black.",
-    ),
-]
-MaxImageSize = Annotated[
-    int | None,
-    typer.Option(
-        "--max_image_size", help="Longer side to which larger images are scaled down, in pixels. -1: COLMAP's default."
-    ),
-]
-MaxNumFeatures = Annotated[
-    int | None, typer.Option("--max_num_features", help="Maximum number of SIFT features per image.")
-]
-Method = Annotated[
-    str, typer.Option("--method", metavar=METHODS, help="Method that solves camera positions from the viewing graph.")
-]
-RotationAveraging = Annotated[
-    str, typer.Option("--rotation_averaging", metavar="robust|chordal", help="Method of rotation averaging.")
-]
-OutlierFilter = Annotated[
-    str, typer.Option("--outlier_filter", metavar="robust|1dsfm|none", help="Filter of false translation directions.")
-]
-RotationGate = Annotated[
-    float,
-    typer.Option(
-        *colmap_flags.ROTATION_GATE,
-        help="Drop pairs whose rotation is further than this from the averaged ones, in degrees. 0: keep all.",
-    ),
-]
-EdgeWeights = Annotated[
-    str, typer.Option("--edge_weights", metavar="information|inliers|unit", help="How pairs are weighted.")
-]
-TrustFocalLengths = Annotated[
-    str,
-    typer.Option(
-        "--trust_focal_lengths",
-        metavar="auto|always|never",
-        help="Whether to trust the focal lengths stored in the database.",
-    ),
-]
-MinNumMatches = Annotated[
-    int, typer.Option(*colmap_flags.MIN_NUM_MATCHES, help="Minimum number of inlier matches of a pair that is used.")
-]
-RefineFocalLength = Annotated[
-    str, typer.Option(*colmap_flags.REFINE_FOCAL_LENGTH, metavar="0|1", help="Refine focal lengths.")
-]
-RefinePrincipalPoint = Annotated[
-    str, typer.Option(*colmap_flags.REFINE_PRINCIPAL_POINT, metavar="0|1", help="Refine principal points.")
-]
-RefineExtraParams = Annotated[
-    str, typer.Option(*colmap_flags.REFINE_EXTRA_PARAMS, metavar="0|1", help="Refine distortion coefficients.")
-]
-RefineIntrinsics = Annotated[
-    str,
-    typer.Option(
-        *colmap_flags.REFINE_INTRINSICS,
-        metavar="0|1",
-        help="Refine focal lengths and distortion coefficients (GLOMAP's flag).",
-    ),
-]
-ExtractColors = Annotated[
-    str, typer.Option(*colmap_flags.EXTRACT_COLORS, metavar="0|1", help="Colour points from the photographs.")
-]
-ShareCameras = Annotated[
-    str,
-    typer.Option(
-        "--share_cameras",
-        metavar="0|1",
-        help="Share intrinsics between images with the same initial calibration, unless they show different ones.",
-    ),
-]
-NumThreads = Annotated[int, typer.Option(*colmap_flags.NUM_THREADS, help="Number of threads. -1: all cores.")]
-RandomSeed = Annotated[
-    int,
-    typer.Option(
-        *colmap_flags.RANDOM_SEED,
-        help="Seed of all random choices. The same seed with one thread gives the same result.",
-    ),
-]
-CovariancesFlag = Annotated[
-    str,
-    typer.Option(
-        "--covariances",
-        metavar="0|1",
-        help="Write the standard deviations of camera poses, before bundle adjustment, to images.csv.",
-    ),
-]
-ExcludedPairs = Annotated[
-    Path | None,
-    typer.Option("--excluded_pairs_path", help="Text file with two image names per line. These pairs are not used."),
-]
-TrustedPairs = Annotated[
-    Path | None,
-    typer.Option("--trusted_pairs_path", help="Text file with two image names per line. No filter drops these pairs."),
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace models in the output folder.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted job: reuse its finished stages.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print every event and COLMAP's own log.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -204,39 +43,39 @@ def version_only(
 
 @app.command()
 def run(
-    image_path: ImagePath,
-    output_path: OutputPath,
-    camera_model: CameraModel = "SIMPLE_RADIAL",
-    camera_params: CameraParams = "",
-    camera_mode: CameraMode = "auto",
-    quality: Quality = "high",
-    matching: Matching = None,
-    sequential_overlap: SequentialOverlap = FeatureOptions.sequential_overlap,
-    image_list_path: ImageListPath = None,
-    mask_path: MaskPath = None,
-    max_image_size: MaxImageSize = None,
-    max_num_features: MaxNumFeatures = None,
-    method: Method = DEFAULTS.solve.method,
-    rotation_averaging: RotationAveraging = DEFAULTS.solve.rotation_averaging,
-    outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
-    rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
-    edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
-    covariances: CovariancesFlag = "0",
-    trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
-    excluded_pairs_path: ExcludedPairs = None,
-    trusted_pairs_path: TrustedPairs = None,
-    min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
-    ba_refine_focal_length: RefineFocalLength = "1",
-    ba_refine_principal_point: RefinePrincipalPoint = "0",
-    ba_refine_extra_params: RefineExtraParams = "1",
-    share_cameras: ShareCameras = "1",
-    extract_colors: ExtractColors = "1",
-    num_threads: NumThreads = -1,
-    random_seed: RandomSeed = 0,
-    overwrite: Overwrite = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    image_path: flags.ImagePath,
+    output_path: flags.OutputPath,
+    camera_model: flags.CameraModel = "SIMPLE_RADIAL",
+    camera_params: flags.CameraParams = "",
+    camera_mode: flags.CameraMode = "auto",
+    quality: flags.Quality = "high",
+    matching: flags.Matching = None,
+    sequential_overlap: flags.SequentialOverlap = FeatureOptions.sequential_overlap,
+    image_list_path: flags.ImageListPath = None,
+    mask_path: flags.MaskPath = None,
+    max_image_size: flags.MaxImageSize = None,
+    max_num_features: flags.MaxNumFeatures = None,
+    method: flags.Method = DEFAULTS.solve.method,
+    rotation_averaging: flags.RotationAveraging = DEFAULTS.solve.rotation_averaging,
+    outlier_filter: flags.OutlierFilter = DEFAULTS.solve.outlier_filter,
+    rotation_gate_deg: flags.RotationGate = DEFAULTS.solve.rotation_gate_deg,
+    edge_weights: flags.EdgeWeights = DEFAULTS.solve.edge_weights,
+    covariances: flags.CovariancesFlag = "0",
+    trust_focal_lengths: flags.TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    excluded_pairs_path: flags.ExcludedPairs = None,
+    trusted_pairs_path: flags.TrustedPairs = None,
+    min_num_matches: flags.MinNumMatches = DEFAULTS.read.min_num_inliers,
+    ba_refine_focal_length: flags.RefineFocalLength = "1",
+    ba_refine_principal_point: flags.RefinePrincipalPoint = "0",
+    ba_refine_extra_params: flags.RefineExtraParams = "1",
+    share_cameras: flags.ShareCameras = "1",
+    extract_colors: flags.ExtractColors = "1",
+    num_threads: flags.NumThreads = -1,
+    random_seed: flags.RandomSeed = 0,
+    overwrite: flags.Overwrite = False,
+    resume: flags.Resume = False,
+    quiet: flags.Quiet = False,
+    verbose: flags.Verbose = False,
 ) -> None:
     """From a folder of photographs to models: features, matching, viewing graph, triangulation, bundle adjustment."""
     with _job(quiet, verbose) as reporter:
@@ -282,31 +121,31 @@ def run(
 @app.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
 def mapper(
     context: typer.Context,
-    database_path: DatabasePath,
-    output_path: OutputPath,
-    image_path: MapperImagePath = None,
-    method: Method = DEFAULTS.solve.method,
-    rotation_averaging: RotationAveraging = DEFAULTS.solve.rotation_averaging,
-    outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
-    rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
-    edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
-    covariances: CovariancesFlag = "0",
-    trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
-    excluded_pairs_path: ExcludedPairs = None,
-    trusted_pairs_path: TrustedPairs = None,
-    min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
-    ba_refine_focal_length: RefineFocalLength = "1",
-    ba_refine_principal_point: RefinePrincipalPoint = "0",
-    ba_refine_extra_params: RefineExtraParams = "1",
-    optimize_intrinsics: RefineIntrinsics = "",
-    share_cameras: ShareCameras = "1",
-    extract_colors: ExtractColors = "1",
-    num_threads: NumThreads = -1,
-    random_seed: RandomSeed = 0,
-    overwrite: Overwrite = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    database_path: flags.DatabasePath,
+    output_path: flags.OutputPath,
+    image_path: flags.MapperImagePath = None,
+    method: flags.Method = DEFAULTS.solve.method,
+    rotation_averaging: flags.RotationAveraging = DEFAULTS.solve.rotation_averaging,
+    outlier_filter: flags.OutlierFilter = DEFAULTS.solve.outlier_filter,
+    rotation_gate_deg: flags.RotationGate = DEFAULTS.solve.rotation_gate_deg,
+    edge_weights: flags.EdgeWeights = DEFAULTS.solve.edge_weights,
+    covariances: flags.CovariancesFlag = "0",
+    trust_focal_lengths: flags.TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    excluded_pairs_path: flags.ExcludedPairs = None,
+    trusted_pairs_path: flags.TrustedPairs = None,
+    min_num_matches: flags.MinNumMatches = DEFAULTS.read.min_num_inliers,
+    ba_refine_focal_length: flags.RefineFocalLength = "1",
+    ba_refine_principal_point: flags.RefinePrincipalPoint = "0",
+    ba_refine_extra_params: flags.RefineExtraParams = "1",
+    optimize_intrinsics: flags.RefineIntrinsics = "",
+    share_cameras: flags.ShareCameras = "1",
+    extract_colors: flags.ExtractColors = "1",
+    num_threads: flags.NumThreads = -1,
+    random_seed: flags.RandomSeed = 0,
+    overwrite: flags.Overwrite = False,
+    resume: flags.Resume = False,
+    quiet: flags.Quiet = False,
+    verbose: flags.Verbose = False,
 ) -> None:
     """From a COLMAP database to models. Takes the flags of colmap's and glomap's mappers.
 
@@ -349,25 +188,25 @@ def mapper(
 
 @app.command()
 def solve(
-    database_path: DatabasePath,
-    output_path: OutputPath,
-    method: Method = DEFAULTS.solve.method,
-    rotation_averaging: RotationAveraging = DEFAULTS.solve.rotation_averaging,
-    outlier_filter: OutlierFilter = DEFAULTS.solve.outlier_filter,
-    rotation_gate_deg: RotationGate = DEFAULTS.solve.rotation_gate_deg,
-    edge_weights: EdgeWeights = DEFAULTS.solve.edge_weights,
-    covariances: CovariancesFlag = "0",
-    trust_focal_lengths: TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
-    excluded_pairs_path: ExcludedPairs = None,
-    trusted_pairs_path: TrustedPairs = None,
-    min_num_matches: MinNumMatches = DEFAULTS.read.min_num_inliers,
-    ba_refine_focal_length: RefineFocalLength = "1",
-    num_threads: NumThreads = -1,  # noqa: ARG001  -- of every verb; the solver itself has one thread
-    random_seed: RandomSeed = 0,
-    overwrite: Overwrite = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    database_path: flags.DatabasePath,
+    output_path: flags.OutputPath,
+    method: flags.Method = DEFAULTS.solve.method,
+    rotation_averaging: flags.RotationAveraging = DEFAULTS.solve.rotation_averaging,
+    outlier_filter: flags.OutlierFilter = DEFAULTS.solve.outlier_filter,
+    rotation_gate_deg: flags.RotationGate = DEFAULTS.solve.rotation_gate_deg,
+    edge_weights: flags.EdgeWeights = DEFAULTS.solve.edge_weights,
+    covariances: flags.CovariancesFlag = "0",
+    trust_focal_lengths: flags.TrustFocalLengths = DEFAULTS.read.trust_focal_lengths,
+    excluded_pairs_path: flags.ExcludedPairs = None,
+    trusted_pairs_path: flags.TrustedPairs = None,
+    min_num_matches: flags.MinNumMatches = DEFAULTS.read.min_num_inliers,
+    ba_refine_focal_length: flags.RefineFocalLength = "1",
+    num_threads: flags.NumThreads = -1,  # noqa: ARG001  -- of every verb; the solver itself has one thread
+    random_seed: flags.RandomSeed = 0,
+    overwrite: flags.Overwrite = False,
+    resume: flags.Resume = False,
+    quiet: flags.Quiet = False,
+    verbose: flags.Verbose = False,
 ) -> None:
     """The viewing graph only: OUT/0 holds poses without points."""
     with _job(quiet, verbose) as reporter:
@@ -389,14 +228,14 @@ def solve(
 
 @app.command()
 def demo(
-    output_path: OutputPath,
+    output_path: flags.OutputPath,
     num_images: Annotated[int, typer.Option("--num_images", min=3, help="Photographs to render.")] = 24,
     seed: Annotated[int, typer.Option("--seed", "--random_seed", min=0, help="Of scene, cameras and noise.")] = 0,
-    num_threads: NumThreads = -1,
-    overwrite: Overwrite = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    num_threads: flags.NumThreads = -1,
+    overwrite: flags.Overwrite = False,
+    resume: flags.Resume = False,
+    quiet: flags.Quiet = False,
+    verbose: flags.Verbose = False,
 ) -> None:
     """Render photographs of a scene from known cameras, make a model of them, and compare it with the truth."""
     with _job(quiet, verbose) as reporter:
