@@ -26,7 +26,7 @@ REFINE_EXTRA_PARAMS = (
 REFINE_INTRINSICS = ("--BundleAdjustment.optimize_intrinsics",)
 EXTRACT_COLORS = ("--extract_colors", "--Mapper.extract_colors")
 NUM_THREADS = ("--num_threads", "--Mapper.num_threads", "--GlobalMapper.num_threads")
-RANDOM_SEED = ("--random_seed", "--Mapper.random_seed", "--GlobalMapper.random_seed")
+RANDOM_SEED = ("--random_seed", "--seed", "--Mapper.random_seed", "--GlobalMapper.random_seed")
 MIN_NUM_MATCHES = (
     "--min_num_matches",
     "--Mapper.min_num_matches",

@@ -3,11 +3,13 @@
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_type_hints
 
 import pytest
 from typer.testing import CliRunner
 
 import colmap_vg.cli
+from colmap_vg.cli.flags import FeatureFlags, JobFlags, ModelFlags, ReadFlags, SolveFlags
 from colmap_vg.cli.main import app
 from colmap_vg.errors import MappingError
 from colmap_vg.options import FeatureOptions, MappingOptions, SolveOptions
@@ -150,10 +152,33 @@ def test_quality_stands_for_features_and_explicit_flags_win(jobs: Jobs) -> None:
 
 
 def test_unknown_quality_and_matching_are_usage_errors(jobs: Jobs) -> None:
-    for flags, words in ((("--quality", "best"), "low, medium"), (("--matching", "tree"), "selected")):
+    for flags, words in ((("--quality", "best"), "'low', 'medium'"), (("--matching", "tree"), "selected")):
         result = CliRunner().invoke(app, ["run", "--image_path", "i", "--output_path", "o", *flags])
         assert result.exit_code == 2
         assert words in result.output
+
+
+def test_values_that_are_no_switch_or_number_are_usage_errors() -> None:
+    for flag, value, words in (("--covariances", "maybe", "0, 1, true"), ("--camera_params", "1,f", "separated by")):
+        result = CliRunner().invoke(app, ["run", "--image_path", "i", "--output_path", "o", flag, value])
+        assert result.exit_code == 2
+        assert flag in result.output
+        assert words in result.output
+
+
+def test_every_flag_of_a_group_is_in_the_help_of_its_verbs() -> None:
+    for verb, groups in (
+        ("run", (FeatureFlags, SolveFlags, ReadFlags, ModelFlags, JobFlags)),
+        ("mapper", (SolveFlags, ReadFlags, ModelFlags, JobFlags)),
+        ("solve", (SolveFlags, ReadFlags, JobFlags)),
+        ("demo", (JobFlags,)),
+    ):
+        shown = CliRunner().invoke(app, [verb, "--help"]).output
+        for group in groups:
+            for name, hint in get_type_hints(group, include_extras=True).items():
+                option = hint.__metadata__[0]
+                assert option.default in shown, (verb, group, name)
+                assert option.help, (group, name)
 
 
 def test_demo_flags(jobs: Jobs) -> None:
