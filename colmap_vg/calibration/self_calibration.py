@@ -55,6 +55,7 @@ def estimate_focal_lengths(
     image_sizes: Array,
     *,
     given: BoolArray | None = None,
+    lens_groups: IntArray | None = None,
     aspect_ratios: Array | None = None,
     min_num_matches: int = 16,
     max_effective_matches: float = 100.0,
@@ -83,6 +84,9 @@ def estimate_focal_lengths(
     given : (c,) bool array, optional
         Cameras whose focal length was given, by EXIF or the user: it falls only to a vote that contradicts it, a guess
         to any reliable vote. Missing: none.
+    lens_groups : (c,) int array, optional
+        Equal for cameras that probably have one lens. Where the pairs of one of them decide its focal length, rotation
+        cycles are not asked for the others, which then stay undecided. Missing: each camera has its own.
     aspect_ratios : (c,) array, optional
         Vertical over horizontal focal length; 1 where missing.
     min_num_matches : int
@@ -126,6 +130,8 @@ def estimate_focal_lengths(
     by_cycles, decided = None, reliable.copy()
     # A camera without pairs is not decided by what other cameras' cycles say.
     asked = ~reliable & (by_pairs.num_pairs > 0)
+    if lens_groups is not None:
+        asked &= given | ~np.isin(lens_groups, lens_groups[reliable & ~given])
     pairs = chosen_pairs(F, edges[used], camera_idx, of_used, p1, p2) if asked.any() else None
     if pairs is not None:
         aspect = np.ones(len(focal)) if aspect_ratios is None else aspect_ratios

@@ -5,7 +5,9 @@ CALIBRATED under a focal length 15 % off; without one, nearly every pair is UNCA
 right focal length. The matches tell: each pair's fundamental matrix votes for the focals that make it essential.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,9 @@ from colmap_vg.colmap_io.tables import CALIBRATED, PANORAMIC, PLANAR, PLANAR_OR_
 from colmap_vg.colmap_io.undistortion import undistorted_keypoints
 from colmap_vg.options import ReadOptions
 from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_subset
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -122,13 +127,9 @@ def _in_common(tables: DatabaseTables, found: Array, calibration: SelfCalibratio
     decided, sigmas = calibration.decided & ~given, calibration.by_pairs.estimates.sigmas
     size = np.array([max(c.width, c.height) for c in tables.cameras], dtype=float)
     anywhere = np.log(np.median((found / size)[calibration.decided])) if calibration.decided.any() else None
-    kinds: dict[object, list[int]] = {}
-    for row in np.flatnonzero(~given):
-        camera = tables.cameras[row]
-        kinds.setdefault((camera.model_name, camera.width, camera.height), []).append(int(row))
-    result = found.copy()
-    for members in kinds.values():
-        rows = np.array(members)
+    groups, result = _lens_groups(tables.cameras), found.copy()
+    for group in np.unique(groups[~given]):
+        rows = np.flatnonzero((groups == group) & ~given)
         voters = rows[decided[rows]]
         if len(voters) == 0:
             if anywhere is not None:
@@ -144,6 +145,13 @@ def _in_common(tables: DatabaseTables, found: Array, calibration: SelfCalibratio
         joined = np.concatenate([voters[agree], rows[~decided[rows]]])
         result[joined] = np.exp(common) * size[joined]
     return result
+
+
+def _lens_groups(cameras: "Sequence[pycolmap.Camera]") -> IntArray:
+    """Number of each camera's model and image size: cameras that share both probably have one lens."""
+    kinds: dict[object, int] = {}
+    keys = [(camera.model_name, camera.width, camera.height) for camera in cameras]
+    return np.array([kinds.setdefault(key, len(kinds)) for key in keys], dtype=np.int64)
 
 
 def _self_calibration(
@@ -173,6 +181,7 @@ def _self_calibration(
         np.array([[c.principal_point_x, c.principal_point_y] for c in tables.cameras]),
         np.array([[c.width, c.height] for c in tables.cameras], dtype=float),
         given=given,
+        lens_groups=_lens_groups(tables.cameras),
         aspect_ratios=np.array([c.focal_length_y / c.focal_length_x for c in tables.cameras]),
     )
 

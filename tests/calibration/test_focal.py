@@ -10,6 +10,7 @@ from colmap_vg.calibration.self_calibration import estimate_focal_lengths
 from colmap_vg.errors import GraphError
 from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
 from colmap_vg.two_view.fundamental_covariance import fundamental_covariances
+from colmap_vg.two_view.segments import rows_of_segments
 
 
 def _evidence(scene):
@@ -126,6 +127,32 @@ def test_turntables_are_left_to_rotation_cycles():
     assert found.by_cycles is not None
     assert found.found.all()
     assert found.focal_lengths[0] == pytest.approx(1800.0, rel=0.04)  # a start for the adjustments
+
+
+def test_cycles_are_not_asked_for_a_lens_that_pairs_decide():
+    scene = pixel_scene(10, [1000.0], num_matches=200)
+    of_first = np.flatnonzero((scene.edges == 0).any(axis=1))
+    kept = np.setdiff1d(np.arange(len(scene.edges)), of_first[2:])
+    rows, offsets = rows_of_segments(scene.offsets, kept)
+
+    def estimated(**options):
+        return estimate_focal_lengths(
+            scene.edges[kept],
+            np.where(np.arange(scene.edges.max() + 1) == 0, 1, 0),
+            offsets,
+            scene.points1[rows],
+            scene.points2[rows],
+            np.array([1200.0, 1200.0]),
+            np.repeat(scene.principal_points, 2, axis=0),
+            np.repeat(scene.image_sizes, 2, axis=0),
+            **options,
+        )
+
+    apart, alike = estimated(), estimated(lens_groups=np.array([0, 0]))
+    assert apart.by_cycles is not None
+    assert alike.by_cycles is None
+    assert alike.decided.tolist() == [True, False]
+    assert alike.focal_lengths[1] == 1200.0
 
 
 def test_cameras_that_nothing_is_known_of_keep_their_focal():
