@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.two_view.pieces import Block, Pieces, shrunk
+from colmap_vg.two_view.pieces import Block, Pieces, rescaled_rays
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -36,13 +36,13 @@ class TripletRays:
         Unit rays in a, b and c, each in its own camera: nine columns.
     variances : (3, q) array
         ``1 / f^2``, squared radians per squared pixel.
-    shrinks : (3, q) array or None
+    focal_ratios : (3, q) array or None
         Factors on the first two coordinates of the rays, which are then normalised: those of a longer focal length.
     """
 
     pieces: Pieces
     variances: Array
-    shrinks: Array | None = None
+    focal_ratios: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +187,8 @@ def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
     triplet = rays.pieces.segments[block.pieces]
     columns = rays.pieces.columns[block.pieces]
     own = np.stack([columns[:, 3 * s : 3 * s + 3] for s in range(3)])
-    if rays.shrinks is not None:
-        own = np.stack([shrunk(x, factor[triplet]) for x, factor in zip(own, rays.shrinks, strict=True)])
+    if rays.focal_ratios is not None:
+        own = np.stack([rescaled_rays(x, ratios[triplet]) for x, ratios in zip(own, rays.focal_ratios, strict=True)])
     turns, baselines = poses.rotations[:, triplet], poses.baselines[:, triplet]
     middle = np.moveaxis(own[1], 1, 0)
     a, c = (_side(_turned(turns[s], own[2 * s]), middle, baselines[s].T[:, :, None]) for s in (0, 1))

@@ -108,8 +108,8 @@ class EpipolarProblem:
         """Rays and pixel variances of triplets at logarithms (c,) of factors on the focal lengths."""
         camera = self.camera_idx[triplets.images].T
         focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
-        shrinks = np.exp(-log_scales[camera]) if self.free_focals.any() else None
-        return TripletRays(triplets.pieces, focal**-2.0, shrinks)
+        focal_ratios = np.exp(-log_scales[camera]) if self.free_focals.any() else None
+        return TripletRays(triplets.pieces, focal**-2.0, focal_ratios)
 
 
 def _straightened(rays: Array, radial_terms: Array) -> Array:

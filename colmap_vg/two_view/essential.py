@@ -146,7 +146,7 @@ def in_front_of_both(
     return np.asarray((cosine * along2 > along1) & (along2 > cosine * along1))
 
 
-def judged_poses(
+def check_cheirality(
     rotations: Array, directions: Array, offsets: IntArray, bearings1: Array, bearings2: Array
 ) -> RelativePoses:
     """Given relative poses (m, 3, 3), (m, 3) with their cheirality counts and triangulation angles."""
@@ -193,4 +193,4 @@ def poses_from_essential(E: Array, offsets: IntArray, bearings1: Array, bearings
     best, rows = np.argmax(votes, axis=0), np.arange(len(E))
     R = np.stack([c[0] for c in candidates])[best, rows]
     d = np.stack([c[1] for c in candidates])[best, rows]
-    return judged_poses(R, d, offsets, bearings1, bearings2)
+    return check_cheirality(R, d, offsets, bearings1, bearings2)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
-from colmap_vg.two_view.pieces import Block, Pieces, shrunk
+from colmap_vg.two_view.pieces import Block, Pieces, rescaled_rays
 from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]
@@ -36,13 +36,14 @@ class Matches:
         Unit rays in image 1 and image 2, six columns.
     variances : (2, m) array
         ``1 / f^2`` of camera 1 and 2, squared radians per squared pixel.
-    shrinks : (2, m) array or None
-        Factors on the first two coordinates of the rays, which are then normalised: those of a longer focal length.
+    focal_ratios : (2, m) array or None
+        Old over new focal length of camera 1 and 2: the first two coordinates of the rays are multiplied by it, and the
+        rays normalised.
     """
 
     pieces: Pieces
     variances: Array
-    shrinks: Array | None = None
+    focal_ratios: Array | None = None
 
     @classmethod
     def of_rays(
@@ -58,8 +59,8 @@ class Matches:
 
     def of(self, edges: IntArray) -> "Matches":
         """The matches of some edges, in their order."""
-        shrinks = None if self.shrinks is None else self.shrinks[:, edges]
-        return Matches(self.pieces.of(edges), self.variances[:, edges], shrinks)
+        focal_ratios = None if self.focal_ratios is None else self.focal_ratios[:, edges]
+        return Matches(self.pieces.of(edges), self.variances[:, edges], focal_ratios)
 
 
 def cut_rays(offsets: IntArray, bearings1: Array, bearings2: Array) -> Pieces:
@@ -170,8 +171,9 @@ def derivatives_by_block(
         rays = []
         columns = pieces.columns[block.pieces]
         x1, x2 = columns[:, :3], columns[:, 3:]
-        if matches.shrinks is not None:
-            x1, x2 = (shrunk(x, factor[at.edge]) for x, factor in zip((x1, x2), matches.shrinks, strict=True))
+        if matches.focal_ratios is not None:
+            ratios1, ratios2 = matches.focal_ratios[:, at.edge]
+            x1, x2 = rescaled_rays(x1, ratios1), rescaled_rays(x2, ratios2)
         for Q, x, first, second, v in (
             (at.Q1, x1, -at.z[1], at.z[0], at.v1),
             (at.Q2, x2, at.y[1], -at.y[0], at.v2),
@@ -220,9 +222,9 @@ def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -
     edge = matches.pieces.segments[block.pieces]
     Q1, Q2 = frames1[edge], frames2[edge]
     columns = matches.pieces.columns[block.pieces]
-    shrinks = (None, None) if matches.shrinks is None else matches.shrinks[:, edge]
-    y, depth1 = _turned(Q1, columns[:, :3], shrinks[0])
-    z, depth2 = _turned(Q2, columns[:, 3:], shrinks[1])
+    focal_ratios = (None, None) if matches.focal_ratios is None else matches.focal_ratios[:, edge]
+    y, depth1 = _turned(Q1, columns[:, :3], focal_ratios[0])
+    z, depth2 = _turned(Q2, columns[:, 3:], focal_ratios[1])
     v1, v2 = matches.variances[:, edge, None]
     c = z[0] * y[1] - z[1] * y[0]
     squared = c * c
@@ -232,14 +234,14 @@ def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -
     return _AtFrames(edge, Q1, Q2, depth1, depth2, y, z, v1, v2, c, variance, c / np.sqrt(variance))
 
 
-def _turned(Q: Array, x: Array, shrink: Array | None) -> tuple[Array, Array]:
-    """Coordinates ``Q^T x`` (3, pieces, length) of unit rays (pieces, 3, length), shrunk where asked, and depths."""
+def _turned(Q: Array, x: Array, focal_ratio: Array | None) -> tuple[Array, Array]:
+    """Coordinates ``Q^T x`` (3, pieces, length) and depths of unit rays (pieces, 3, length) after rescaling."""
     depth = x[:, 2]
-    if shrink is None:
+    if focal_ratio is None:
         return np.moveaxis(np.swapaxes(Q, 1, 2) @ x, 1, 0), depth
-    # Shrinking goes with the frame, and the length is that of a ray that was of length one.
-    factors = np.stack([shrink, shrink, np.ones_like(shrink)], axis=1)
-    squared = np.square(shrink)[:, None]
+    # The frame is scaled instead of the rays; the length follows from that of a unit ray.
+    factors = np.stack([focal_ratio, focal_ratio, np.ones_like(focal_ratio)], axis=1)
+    squared = np.square(focal_ratio)[:, None]
     inverse = 1.0 / np.sqrt(squared + (1.0 - squared) * (depth * depth))
     turned = np.swapaxes(Q * factors[:, :, None], 1, 2) @ x
     turned *= inverse[:, None]
