@@ -1,4 +1,4 @@
-"""What all rotation averaging takes and returns: checked edges, weights and relative rotations; the result."""
+"""Input checks and result type shared by all rotation-averaging solvers."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RotationResult:
-    """Absolute rotations and how the averaging ended. The first image's gauge is free: any ``R_i Q`` fits as well.
+    """Absolute rotations with convergence information. They are determined up to a common rotation Q, ``R_i Q``.
 
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
     cost : float
-        The solver's own objective at these rotations.
+        Objective of the solver at these rotations.
     num_iterations : int
     converged : bool
         Whether the step fell below the tolerance before the iteration limit.
@@ -39,9 +39,9 @@ class RotationResult:
 def checked_problem(
     num_images: int, edges: ArrayLike, rotations: ArrayLike, weights: ArrayLike | None
 ) -> tuple[IntArray, Array, Array]:
-    """Edges, relative rotations and weights as arrays, after checking that they determine all rotations.
+    """Convert edges, relative rotations and weights to arrays and check that they determine all rotations.
 
-    Edges of weight zero count as absent.
+    Edges of weight zero are treated as absent.
 
     Raises
     ------
@@ -75,13 +75,13 @@ def checked_problem(
         shown = ", ".join(map(str, cut[:5])) + (", ..." if len(cut) > 5 else "")
         raise GraphError(
             f"rotation averaging: the graph is disconnected, {component.max() + 1} components; image rows {shown} "
-            "are not linked to the largest one: solve each component by itself"
+            "are not connected to the largest one: solve each component separately"
         )
     return edges, R, w
 
 
 def checked_initial(num_images: int, initial: ArrayLike | None) -> Array | None:
-    """Initial rotations as an array of its own, or None.
+    """Copy and check initial rotations; None stays None.
 
     Raises
     ------
