@@ -1,6 +1,6 @@
 """The viewing graph: images as nodes, verified pairs as edges with relative poses.
 
-Conventions, written down once. World to camera is ``x_cam = R x_world + t`` (COLMAP's ``cam_from_world``).
+World to camera is ``x_cam = R x_world + t`` (COLMAP's ``cam_from_world``). Correspondence with the paper's notation:
 
 ===================================================  ==========================================================
 paper (Nasiri et al.)                                here
@@ -30,12 +30,12 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
-    """All images and verified pairs of a scene, unusable ones too. Arrays are read-only by convention.
+    """All images and verified pairs of a scene, including unusable ones. Arrays are read-only by convention.
 
     Attributes
     ----------
     image_ids : (n,) int64 array
-        Unique ids, the database's.
+        Unique image ids of the database.
     edges : (m, 2) int64 array
         Rows into `image_ids`, two different ones per edge.
     cam2_from_cam1_rotations : (m, 3, 3) array
@@ -43,30 +43,30 @@ class ViewGraph:
     cam2_in_cam1_directions : (m, 3) array
         Unit vectors from camera 1 towards camera 2, in camera 1's frame.
     num_inliers : (m,) int64 array or None
-        Verified matches of each edge.
+        Number of verified matches of each edge.
     camera_idx : (n,) int64 array or None
         Row of each image's camera in the per-camera arrays.
     image_names : tuple of str
         Names in the order of `image_ids`; empty when unknown.
     camera_ids : (c,) int64 array or None
-        The database's camera ids.
+        Camera ids of the database.
     camera_focal_lengths : (c,) array or None
-        Mean focal length in pixels under which bearings and relative poses were taken.
+        Mean focal length, pixels, with which bearings and relative poses were computed.
     camera_focal_known : (c,) bool array or None
-        Whether that focal length was given (calibrated, or from EXIF and not contradicted), not found by us.
+        Whether that focal length was given (calibrated, or from EXIF and not contradicted) rather than estimated.
     camera_radial : (c,) bool array or None
-        Whether the camera's model has a radial term that may be found with its focal length.
+        Whether the camera's model has a radial term that may be estimated with its focal length.
     read_verdicts : (m,) str array or None
-        `EdgeVerdict` words given on reading; edges other than ``kept`` and ``rotation_only`` are not solved with.
+        `EdgeVerdict` words from reading; edges other than ``kept`` and ``rotation_only`` are not used by the solver.
     trusted : (m,) bool array or None
-        Edges that no filter may drop, on the user's word.
+        Edges that no filter may drop, as specified by the user.
     found_radial_terms : (c,) array or None
-        Radial terms, at the database's focal lengths, of cameras that the database tells no distortion of. Bearings are
-        taken with them.
+        Estimated radial terms, at the database's focal lengths, of cameras without distortion in the database. Bearings
+        are computed with them.
     verified_anew : (m,) bool array or None
-        Pairs whose matches or configuration are not those of the database, which did not explain each other.
+        Pairs that were verified again, since matches and configuration in the database were inconsistent.
     planar : (m,) bool array or None
-        Pairs explained by a homography; their relative pose is less certain.
+        Pairs explained by a homography, whose relative pose is less certain.
     triangulation_angles : (m,) array or None
         Median angle between the rays of an edge's inliers, radians.
     edge_information : (m, 5, 5) array or None
@@ -130,21 +130,21 @@ class ViewGraph:
 
     @property
     def has_rotation(self) -> BoolArray:
-        """Edges whose rotation may be used, (m,)."""
+        """Mask (m,) of the edges whose rotation may be used."""
         if self.read_verdicts is None:
             return np.ones(self.num_edges, dtype=bool)
         return np.isin(self.read_verdicts, [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
 
     @property
     def has_direction(self) -> BoolArray:
-        """Edges whose rotation and direction may be used, (m,)."""
+        """Mask (m,) of the edges whose rotation and direction may be used."""
         if self.read_verdicts is None:
             return np.ones(self.num_edges, dtype=bool)
         return np.asarray(self.read_verdicts == EdgeVerdict.KEPT)
 
     @property
     def has_inliers(self) -> bool:
-        """Whether the matched bearings are in the graph."""
+        """Whether the graph contains the bearings of the matches."""
         return self.inlier_offsets is not None and self.inlier_bearings1 is not None and len(self.inlier_bearings1) > 0
 
     def _check_shapes(self) -> None:
@@ -233,7 +233,7 @@ _TOGETHER = (
     ("camera_ids", "camera_focal_lengths"),
 )
 _MAX_ROW = 2**31
-"""A larger row number is a mistake, not a camera: arrays of that length would be made for it."""
+"""Upper limit of camera rows, since arrays of that length would be allocated for a larger, mistaken one."""
 
 
 _KINDS: dict[str, type] = {
@@ -287,7 +287,7 @@ _ALLOWED = {"i": ("iu", "integers"), "f": ("iuf", "real numbers"), "b": ("b", "T
 
 
 def _no_information(matrices: Array) -> BoolArray:
-    """Matrices (m, 5, 5) that are not finite, or have a negative variance, or are not symmetric."""
+    """Mask (m,) of matrices (m, 5, 5) that are not finite, have a negative diagonal entry, or are not symmetric."""
     with np.errstate(invalid="ignore"):
         size = np.abs(matrices).max(axis=(1, 2), initial=0.0)
         skew = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max(axis=(1, 2), initial=0.0)
