@@ -225,11 +225,11 @@ def _minimized(curves: FocalCurves, log_focals: Array) -> tuple[Array, Array]:
     total = sum_at_nodes(c, curves.camera, curves.costs(fine[curves.camera], log_focals))
     row, k = np.arange(c), np.clip(np.argmin(total, axis=1), 1, len(_FINE_SHIFTS) - 2)
     before, at, after = total[row, k - 1], total[row, k], total[row, k + 1]
-    bend, width = before - 2.0 * at + after, _FINE_SHIFTS[1] - _FINE_SHIFTS[0]
-    inside = (bend > 0) & (at <= before) & (at <= after) & (center > LOWEST) & (center < HIGHEST)
-    shift = np.where(inside, 0.5 * (before - after) / np.where(inside, bend, 1.0), 0.0)
+    curvature, width = before - 2.0 * at + after, _FINE_SHIFTS[1] - _FINE_SHIFTS[0]
+    inside = (curvature > 0) & (at <= before) & (at <= after) & (center > LOWEST) & (center < HIGHEST)
+    shift = np.where(inside, 0.5 * (before - after) / np.where(inside, curvature, 1.0), 0.0)
     # The cost is a chi-square: twice its inverse second derivative is the variance.
-    sigma = np.where(inside, width * np.sqrt(2.0 / np.where(inside, bend, 1.0)), np.inf)
+    sigma = np.where(inside, width * np.sqrt(2.0 / np.where(inside, curvature, 1.0)), np.inf)
     return fine[row, k] + width * shift, sigma
 
 

@@ -68,8 +68,8 @@ class FocalCurves:
 
     def deviations(self, log_f: Array, log_focals: Array) -> Array:
         """``h = (s1 - s2) / (s1 + s2)`` at log focals log_f (o, g) of the varying camera: (o, g)."""
-        held = (log_focals[:, None] if log_focals.ndim == 1 else log_focals)[self.cameras]
-        f1, f2 = (np.exp(2.0 * np.where(self.varies[:, s, None], log_f, held[:, s])) for s in (0, 1))
+        log_fixed = (log_focals[:, None] if log_focals.ndim == 1 else log_focals)[self.cameras]
+        f1, f2 = (np.exp(2.0 * np.where(self.varies[:, s, None], log_f, log_fixed[:, s])) for s in (0, 1))
         n = _sums_of_squares(self.F)[:, :, None]
         k = _sums_of_squares(cofactors(self.F))[:, :, None]
         both = f1 * f2

@@ -92,7 +92,7 @@ class CyclePairs:
 
 
 def vote_focal_by_rotation_cycles(
-    pairs: CyclePairs, unit_focal_lengths: Array, aspect_ratios: Array, principal_points: Array, asked: BoolArray
+    pairs: CyclePairs, unit_focal_lengths: Array, aspect_ratios: Array, principal_points: Array, estimated: BoolArray
 ) -> CycleVote:
     """Estimate the common factor on the focal lengths of some cameras at which rotation cycles are most consistent.
 
@@ -108,7 +108,7 @@ def vote_focal_by_rotation_cycles(
         Vertical over horizontal focal length.
     principal_points : (c, 2) array
         Pixels.
-    asked : (c,) bool array
+    estimated : (c,) bool array
         Cameras whose focal length is estimated.
 
     Returns
@@ -117,7 +117,7 @@ def vote_focal_by_rotation_cycles(
     """
 
     def cost(log_factor: float) -> float:
-        focal = unit_focal_lengths * np.where(asked, np.exp(log_factor), 1.0)
+        focal = unit_focal_lengths * np.where(estimated, np.exp(log_factor), 1.0)
         return _cycle_cost(pairs, focal, focal * aspect_ratios, principal_points)
 
     curve = {float(x): cost(float(x)) for x in _COARSE_LOG_FACTORS}
@@ -135,7 +135,7 @@ def vote_focal_by_rotation_cycles(
     factor = float(np.exp(log_factor))
     return CycleVote(
         factor,
-        unit_focal_lengths * np.where(asked, factor, 1.0),
+        unit_focal_lengths * np.where(estimated, factor, 1.0),
         x,
         y,
         float(sides.min() / max(lowest, 1e-300)),
@@ -144,13 +144,13 @@ def vote_focal_by_rotation_cycles(
 
 
 def focal_fits_cycles(
-    pairs: CyclePairs, focal_lengths: Array, aspect_ratios: Array, principal_points: Array, asked: BoolArray
+    pairs: CyclePairs, focal_lengths: Array, aspect_ratios: Array, principal_points: Array, estimated: BoolArray
 ) -> bool:
     """Whether neither 10 % longer nor 10 % shorter focal lengths of some cameras make rotation cycles more consistent.
 
     Parameters
     ----------
-    pairs, aspect_ratios, principal_points, asked
+    pairs, aspect_ratios, principal_points, estimated
         As for :func:`vote_focal_by_rotation_cycles`.
     focal_lengths : (c,) array
         Pixels.
@@ -159,14 +159,14 @@ def focal_fits_cycles(
     -------
     bool
     """
-    factors = [np.where(asked, np.exp(shift), 1.0) for shift in (0.0, -_CHECKED_SHIFT, _CHECKED_SHIFT)]
+    factors = [np.where(estimated, np.exp(shift), 1.0) for shift in (0.0, -_CHECKED_SHIFT, _CHECKED_SHIFT)]
     at, shorter, longer = (
         _cycle_cost(pairs, focal_lengths * f, focal_lengths * f * aspect_ratios, principal_points) for f in factors
     )
     return min(shorter, longer) >= at
 
 
-def chosen_pairs(
+def select_cycle_pairs(
     F: Array,
     edges: IntArray,
     camera_idx: IntArray,

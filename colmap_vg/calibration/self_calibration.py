@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.calibration.focal import FocalAgreement, focal_agreement
-from colmap_vg.calibration.focal_cycles import CycleVote, chosen_pairs, focal_fits_cycles, vote_focal_by_rotation_cycles
+from colmap_vg.calibration.focal_cycles import (
+    CycleVote,
+    focal_fits_cycles,
+    select_cycle_pairs,
+    vote_focal_by_rotation_cycles,
+)
 from colmap_vg.errors import GraphError
 from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
 from colmap_vg.two_view.fundamental_covariance import fundamental_covariances
@@ -127,24 +132,24 @@ def estimate_focal_lengths(
     focal = np.where(found, by_pairs.focal_lengths, focal_lengths)
     by_cycles, decided = None, reliable.copy()
     # Cycles of other cameras do not determine the focal length of a camera without pairs.
-    asked = ~reliable & (by_pairs.num_pairs > 0)
-    pairs = chosen_pairs(F, edges[used], camera_idx, of_used, p1, p2) if asked.any() else None
+    undecided = ~reliable & (by_pairs.num_pairs > 0)
+    pairs = select_cycle_pairs(F, edges[used], camera_idx, of_used, p1, p2) if undecided.any() else None
     if pairs is not None:
         aspect = np.ones(len(focal)) if aspect_ratios is None else aspect_ratios
-        guessed = asked & ~given
+        guessed = undecided & ~given
         if guessed.any():
             longer = image_sizes if image_sizes.ndim == 1 else image_sizes.max(axis=1)
             by_cycles = vote_focal_by_rotation_cycles(
                 pairs, np.where(guessed, longer, focal), aspect, principal_points, guessed
             )
-            takes = guessed & by_cycles.reliable
-        elif focal_fits_cycles(pairs, focal, aspect, principal_points, asked):
-            takes = np.zeros(len(focal), dtype=bool)
+            replaced = guessed & by_cycles.reliable
+        elif focal_fits_cycles(pairs, focal, aspect, principal_points, undecided):
+            replaced = np.zeros(len(focal), dtype=bool)
         else:
-            by_cycles = vote_focal_by_rotation_cycles(pairs, focal, aspect, principal_points, asked)
-            takes = asked & (by_cycles.reliable and abs(np.log(by_cycles.factor)) > np.log1p(CYCLE_TOLERANCE))
+            by_cycles = vote_focal_by_rotation_cycles(pairs, focal, aspect, principal_points, undecided)
+            replaced = undecided & (by_cycles.reliable and abs(np.log(by_cycles.factor)) > np.log1p(CYCLE_TOLERANCE))
         if by_cycles is not None:
-            decided |= asked & by_cycles.reliable
-            focal = np.where(takes, by_cycles.focal_lengths, focal)
-        found |= takes
+            decided |= undecided & by_cycles.reliable
+            focal = np.where(replaced, by_cycles.focal_lengths, focal)
+        found |= replaced
     return SelfCalibration(focal, found, decided, votes, by_cycles)

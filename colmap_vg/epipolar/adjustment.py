@@ -182,8 +182,8 @@ def adjust_epipolar(
         log_scales = np.zeros(len(lost)) if initial_focal_scales is None else np.log(initial_focal_scales)
         log_scales[lost] = 0.0
         start = Cameras(initial_rotations, gauged(initial_centers), log_scales)
-        held = replace(problem, free_focals=problem.free_focals & ~lost)
-        found = _in_stages(held, start, directions, scales_px, final_sigmas, max_num_iterations, tolerance)
+        restricted = replace(problem, free_focals=problem.free_focals & ~lost)
+        found = _in_stages(restricted, start, directions, scales_px, final_sigmas, max_num_iterations, tolerance)
         diverged = np.abs(np.log(found.focal_scales)) > _MAX_LOG_FOCAL
         if not diverged.any():
             return replace(found, lost_focals=lost)

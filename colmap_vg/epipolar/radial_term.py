@@ -64,8 +64,8 @@ def fit_radial_term(problem: EpipolarProblem, start: AdjustmentResult, free_radi
         if abs(center) + step > MAX_TERM:
             return None
         low, middle, high = (cost(center + side * step) for side in (-1, 0, 1))
-        bend = low - 2.0 * middle + high
-        vertex = center + (0.5 * step * (low - high) / bend if bend > 0.0 else 0.0)
+        curvature = low - 2.0 * middle + high
+        vertex = center + (0.5 * step * (low - high) / curvature if curvature > 0.0 else 0.0)
         center = vertex if cost(vertex) < middle else center
         step /= 4.0
     if cost(center) > (1.0 - MIN_COST_REDUCTION) * cost(0.0):

@@ -63,7 +63,7 @@ def align_positions(estimated: Array, truth: Array) -> tuple[Array, Similarity]:
             f"align_positions needs two (n, 3) arrays with n >= 1, found {estimated.shape} and {truth.shape}"
         )
     if not (np.isfinite(estimated).all() and np.isfinite(truth).all()):
-        raise GraphError("align_positions: positions hold NaN or infinite values; remove unregistered images first")
+        raise GraphError("align_positions: positions have NaN or infinite values; remove unregistered images first")
     scales, rotations, translations = best_similarities(estimated[None], truth[None])
     if not np.isfinite(scales[0]):  # one position, or all equal
         similarity = Similarity(1.0, rotations[0], truth.mean(axis=0) - rotations[0] @ estimated.mean(axis=0))

@@ -107,8 +107,8 @@ class ChordalCost:
         # Exact Hessian of the chordal term by u while it is safely definite, Gauss-Newton Hessian of the translations.
         trace = np.trace(M, axis1=1, axis2=2)[:, None, None]
         exact = trace * np.eye(3) - 0.5 * (M + np.swapaxes(M, 1, 2))
-        bent = 2.0 * self.kappa[:, None, None] * exact
-        C = np.where(trace > MIN_TRACE, bent, 4.0 * self.kappa[:, None, None] * np.eye(3))
+        chordal_hessian = 2.0 * self.kappa[:, None, None] * exact
+        C = np.where(trace > MIN_TRACE, chordal_hessian, 4.0 * self.kappa[:, None, None] * np.eye(3))
         S, weight = so3.hat(s), 2.0 * self.tau[:, None, None]
         ii, jj, ij = (np.zeros((len(s), 6, 6)) for _ in range(3))
         ii[:, :3, :3] = C + weight * (np.swapaxes(S, 1, 2) @ S)
@@ -122,7 +122,7 @@ class ChordalCost:
         # exp(-w_j) exp(w_i) rotates by w_i - w_j - (w_j x w_i) / 2 + ...; Q_i t changes by w_i x (w_i x s) / 2, too.
         outer = pull[:, :, None] * s[:, None, :]
         along = np.einsum("ka,ka->k", pull, s)[:, None, None] * np.eye(3)
-        curvature_jj = bent - C
+        curvature_jj = chordal_hessian - C
         curvature_ii = 0.5 * (outer + np.swapaxes(outer, 1, 2)) - along + curvature_jj
         curvature_ij = 2.0 * self.kappa[:, None, None] * so3.hat(skew) - curvature_jj
         return EdgeTerms(gradient_i, gradient_j, ii, jj, ij, curvature_ii, curvature_jj, curvature_ij)

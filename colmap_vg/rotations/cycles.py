@@ -71,9 +71,9 @@ def rival_share(
     """
     triangles = find_triangles(num_images, edges)
     triangles = triangles[agree[triangles].sum(axis=1) == 1]
-    asked = np.zeros(len(edges), dtype=bool)
-    asked[triangles] = True
-    if (asked & ~agree).sum() < 0.5 * (~agree).sum():
+    in_triangle = np.zeros(len(edges), dtype=bool)
+    in_triangle[triangles] = True
+    if (in_triangle & ~agree).sum() < 0.5 * (~agree).sum():
         return 1.0
     weight = weights[triangles].min(axis=1, initial=np.inf)
     closed = weight @ _close(triangles, edges, cam2_from_cam1_rotations)

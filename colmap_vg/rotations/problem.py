@@ -46,8 +46,8 @@ def checked_problem(
     Raises
     ------
     GraphError
-        Shapes differ, rows lie outside the images or link an image to itself, values are not finite, a weight is
-        negative, or the edges of positive weight leave the graph in several components.
+        Shapes differ, rows are out of range or link an image to itself, values are not finite, a weight is negative, or
+        the edges of positive weight do not connect the graph.
     """
     edges = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
     R = np.asarray(rotations, dtype=np.float64)
@@ -59,7 +59,7 @@ def checked_problem(
     if num_images < 1:
         raise GraphError(f"rotation averaging: needs at least one image, found {num_images}")
     if len(edges) and (edges.min() < 0 or edges.max() >= num_images):
-        raise GraphError(f"rotation averaging: edges hold rows {edges.min()} to {edges.max()} of {num_images} images")
+        raise GraphError(f"rotation averaging: edges have rows {edges.min()} to {edges.max()} of {num_images} images")
     if (edges[:, 0] == edges[:, 1]).any():
         row = int(np.flatnonzero(edges[:, 0] == edges[:, 1])[0])
         raise GraphError(f"rotation averaging: edge {row} links image row {edges[row, 0]} to itself")

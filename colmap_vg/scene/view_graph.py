@@ -184,46 +184,46 @@ class ViewGraph:
                     f"ViewGraph.{name} has shape {value.shape}, expected {shape} (n={n} images, m={m} edges)"
                 )
         if self.image_names and len(self.image_names) != n:
-            raise GraphError(f"ViewGraph.image_names holds {len(self.image_names)} names for {n} images")
+            raise GraphError(f"ViewGraph.image_names has {len(self.image_names)} names for {n} images")
 
     def _check_values(self) -> None:
         n, edges, R, g = self.num_images, self.edges, self.cam2_from_cam1_rotations, self.cam2_in_cam1_directions
         if len(np.unique(self.image_ids)) != n:
             raise GraphError("ViewGraph.image_ids are not unique")
         if len(edges) and (edges.min() < 0 or edges.max() >= n):
-            raise GraphError(f"ViewGraph.edges point outside the {n} images: rows {edges.min()} to {edges.max()}")
+            raise GraphError(f"ViewGraph.edges has rows {edges.min()} to {edges.max()}, outside the {n} images")
         loops = np.flatnonzero(edges[:, 0] == edges[:, 1])
         if len(loops):
             raise GraphError(f"ViewGraph.edges: edge {loops[0]} links image row {edges[loops[0], 0]} to itself")
-        _refuse(
-            "cam2_from_cam1_rotations", np.asarray(~np.isfinite(R).all(axis=(1, 2))), "holds NaN or infinite values"
-        )
-        _refuse("cam2_in_cam1_directions", np.asarray(~np.isfinite(g).all(axis=1)), "holds NaN or infinite values")
+        _refuse("cam2_from_cam1_rotations", np.asarray(~np.isfinite(R).all(axis=(1, 2))), "has NaN or infinite values")
+        _refuse("cam2_in_cam1_directions", np.asarray(~np.isfinite(g).all(axis=1)), "has NaN or infinite values")
         skewed = np.asarray(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
-        _refuse("cam2_from_cam1_rotations", np.asarray(skewed | (np.linalg.det(R) < 0)), "is no rotation matrix")
+        _refuse("cam2_from_cam1_rotations", np.asarray(skewed | (np.linalg.det(R) < 0)), "is not a rotation matrix")
         _refuse(
-            "cam2_in_cam1_directions", np.asarray(np.abs(np.linalg.norm(g, axis=1) - 1.0) > 1e-6), "is no unit vector"
+            "cam2_in_cam1_directions",
+            np.asarray(np.abs(np.linalg.norm(g, axis=1) - 1.0) > 1e-6),
+            "is not a unit vector",
         )
         if self.inlier_offsets is not None:
             o, k = self.inlier_offsets, 0 if self.inlier_bearings1 is None else len(self.inlier_bearings1)
             if o[0] != 0 or o[-1] != k or (np.diff(o) < 0).any():
-                raise GraphError(f"ViewGraph.inlier_offsets must rise from 0 to the number of inliers {k}")
+                raise GraphError(f"ViewGraph.inlier_offsets must increase from 0 to the number of inliers {k}")
         if self.camera_idx is not None and len(self.camera_idx):
             last = self.camera_idx.max() if self.camera_focal_lengths is None else len(self.camera_focal_lengths) - 1
             if self.camera_idx.min() < 0 or self.camera_idx.max() > min(last, _MAX_ROW):
-                raise GraphError(f"ViewGraph.camera_idx holds rows that are no camera's: {self.camera_idx.max()}")
+                raise GraphError(f"ViewGraph.camera_idx has rows without a camera, up to {self.camera_idx.max()}")
         if self.num_inliers is not None:
             _refuse("num_inliers", np.asarray(self.num_inliers < 0), "is negative")
         if self.camera_focal_lengths is not None:
             f = self.camera_focal_lengths
-            _refuse("camera_focal_lengths", np.asarray(~((f > 0) & (f < np.inf))), "is no focal length in pixels")
+            _refuse("camera_focal_lengths", np.asarray(~((f > 0) & (f < np.inf))), "is not a focal length in pixels")
         if self.edge_information is not None:
-            _refuse("edge_information", _no_information(self.edge_information), "is no information matrix")
+            _refuse("edge_information", _invalid_information(self.edge_information), "is not an information matrix")
         for name in ("inlier_bearings1", "inlier_bearings2"):
             rays = getattr(self, name)
             if rays is not None:
                 squared = np.einsum("ka,ka->k", rays, rays)
-                _refuse(name, np.asarray(~(np.abs(squared - 1.0) < 2e-6)), "is no unit vector")
+                _refuse(name, np.asarray(~(np.abs(squared - 1.0) < 2e-6)), "is not a unit vector")
 
 
 _REQUIRED = ("image_ids", "edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions")
@@ -266,27 +266,29 @@ def _array(name: str, value: object, kind: type) -> NDArray[np.generic]:
     try:
         found = np.asarray(value)
     except ValueError as error:
-        raise GraphError(f"ViewGraph.{name} is no array: {error}") from error
+        raise GraphError(f"ViewGraph.{name} is not an array: {error}") from error
     if found.ndim == 0:
         raise GraphError(f"ViewGraph.{name} must be an array, found {found}")
     if name in ("edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions") and found.size == 0:
         found = found.reshape(0, *{"edges": (2,), "cam2_from_cam1_rotations": (3, 3)}.get(name, (3,)))
     allowed, what = _ALLOWED[np.dtype(kind).kind]
     if found.size and found.dtype.kind not in allowed:
-        raise GraphError(f"ViewGraph.{name} must hold {what}, found {found.dtype}")
+        raise GraphError(f"ViewGraph.{name} must have {what}, found {found.dtype}")
     if (
         np.dtype(kind).kind == "i"
         and found.size
         and (found.max() > np.iinfo(kind).max or found.min() < np.iinfo(kind).min)
     ):
-        raise GraphError(f"ViewGraph.{name} holds {found.max()}, too large a number")
+        raise GraphError(
+            f"ViewGraph.{name} has values from {found.min()} to {found.max()}, too large for {kind.__name__}"
+        )
     return np.asarray(found, dtype=kind)
 
 
 _ALLOWED = {"i": ("iu", "integers"), "f": ("iuf", "real numbers"), "b": ("b", "True or False"), "U": ("UO", "words")}
 
 
-def _no_information(matrices: Array) -> BoolArray:
+def _invalid_information(matrices: Array) -> BoolArray:
     """Mask (m,) of matrices (m, 5, 5) that are not finite, have a negative diagonal entry, or are not symmetric."""
     with np.errstate(invalid="ignore"):
         size = np.abs(matrices).max(axis=(1, 2), initial=0.0)

@@ -212,9 +212,9 @@ def _checked(
             + ("" if w is None else f" and weights of shape {w.shape}")
         )
     if len(edges) and (edges.min() < 0 or edges.max() >= num_images):
-        raise GraphError(f"1DSfM: edges hold rows {edges.min()} to {edges.max()} of {num_images} images")
+        raise GraphError(f"1DSfM: edges have rows {edges.min()} to {edges.max()} of {num_images} images")
     if not np.isfinite(directions).all():
-        raise GraphError("1DSfM: directions hold NaN or infinite values")
+        raise GraphError("1DSfM: directions have NaN or infinite values")
     if w is not None and (not np.isfinite(w).all() or (w < 0).any()):
         raise GraphError("1DSfM: weights must be finite and not negative")
     return edges, directions, w

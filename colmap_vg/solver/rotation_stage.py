@@ -91,7 +91,7 @@ def _doubt_rival(state: SolverState, part: Subgraph, found: ConsensusRotations) 
     state.doubt(
         images,
         "Another arrangement of the images agrees with nearly as many matches: the scene may repeat itself, and the"
-        f" model may be folded. It places {len(images)} of {part.num_images} images otherwise ({shown}).",
+        f" model may be folded. The poses of {len(images)} of {part.num_images} images differ in it ({shown}).",
     )
 
 
@@ -107,5 +107,5 @@ def _certify_rotations(
     verdict = "are the global optimum" if found.is_global else "may not be the global optimum"
     state.caveats.append(
         f"The chordal rotations of {part.num_images} images {verdict}: the certificate's smallest eigenvalue is "
-        f"{found.smallest_eigenvalue:.3g}, and no rotations cost less than {1.0 - found.relative_gap:.6f} of theirs."
+        f"{found.smallest_eigenvalue:.3g}, and any rotations cost at least {1.0 - found.relative_gap:.6f} of theirs."
     )

@@ -189,7 +189,7 @@ class SolverState:
         status, message = described(self.image_verdicts, self._converged, agreement, in_doubt)
         still = int((self.edge_verdicts == EdgeVerdict.ROTATION_ONLY).sum())
         if status == SolutionStatus.UNSOLVABLE and still:
-            message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have turned on the spot."
+            message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have rotated without moving."
         return PoseSolution(
             image_ids=self.graph.image_ids,
             cam_from_world_rotations=self._R,
@@ -230,7 +230,7 @@ def described(
     if elsewhere:
         reasons = ", ".join(f"{count} {word}" for word, count in elsewhere.items())
         status = SolutionStatus.PARTIAL
-        message = f"{sum(elsewhere.values())} of {len(image_verdicts)} images are left out of the largest model"
+        message = f"{sum(elsewhere.values())} of {len(image_verdicts)} images are not in the largest model"
         message += f" ({reasons}); see image_verdicts."
     if not converged:
         status = SolutionStatus.NOT_CONVERGED

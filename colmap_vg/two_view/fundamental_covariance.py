@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.linear.robust_losses import cauchy_weight
+from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, MAD_TO_SIGMA, cauchy_weight
 from colmap_vg.two_view.eight_point import cofactors, weighted_moments
 from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import segment_quantiles
@@ -18,7 +18,6 @@ from colmap_vg.two_view.segments import segment_quantiles
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_CAUCHY_SCALE = 2.385  # standard deviations; 95 % efficiency under Gaussian noise
 _MIN_SIGMA_PX = 0.15  # pixels; below this the unmodelled distortion dominates the keypoint noise
 
 
@@ -90,6 +89,6 @@ def _information(offsets: IntArray, points1: Array, points2: Array, F: Array, mi
     squared /= variance
     count = np.diff(offsets)
     median = np.sqrt(segment_quantiles(offsets, pieces.rows(squared)))
-    sigma = np.maximum(1.4826 * median * np.sqrt(count / np.maximum(count - 7, 1)), min_sigma)
-    weights = cauchy_weight(squared / np.square(_CAUCHY_SCALE * sigma)[pieces.segments, None]) / variance
+    sigma = np.maximum(MAD_TO_SIGMA * median * np.sqrt(count / np.maximum(count - 7, 1)), min_sigma)
+    weights = cauchy_weight(squared / np.square(EFFICIENT_CAUCHY * sigma)[pieces.segments, None]) / variance
     return weighted_moments(pieces, weights) / np.square(sigma)[:, None, None], sigma
