@@ -54,7 +54,7 @@ class AdjustmentResult:
     focal_scales : (c,) array
         Factors on the focal lengths that the bearings were computed with; 1 for cameras that were not free.
     lost_focals : (c,) bool array
-        Free focal lengths that the matches do not determine: diverged; fixed at their initial value.
+        Free focal lengths that the matches do not determine: they diverged and are fixed at their initial value.
     reversed_edges : (m,) bool array
         Edges whose given direction is more than a right angle from the solved one; dropped during the adjustment.
     cost : float

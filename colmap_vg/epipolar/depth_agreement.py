@@ -137,7 +137,7 @@ def depth_derivatives_by_block(
         at = _evaluate(rays, poses, block)
         by_rays = np.stack(at.along) / np.sqrt(at.variances * at.variance)[:, None]
         for image in (0, 2):
-            by_rays[image] = _turned(np.swapaxes(at.turns[image // 2], 1, 2), np.moveaxis(by_rays[image], 0, 1))
+            by_rays[image] = _rotated(np.swapaxes(at.turns[image // 2], 1, 2), np.moveaxis(by_rays[image], 0, 1))
         by_pose = np.moveaxis(_jacobian_and_residuals(at, with_focals)[:, :-1], 1, 0)
         offsets = pieces.offsets[block.segments.start : block.segments.stop + 1]
         yield (
@@ -193,7 +193,7 @@ def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
         own = np.stack([rescaled_rays(x, ratios[triplet]) for x, ratios in zip(own, rays.focal_ratios, strict=True)])
     turns, baselines = poses.rotations[:, triplet], poses.baselines[:, triplet]
     middle = np.moveaxis(own[1], 1, 0)
-    a, c = (_side(_turned(turns[s], own[2 * s]), middle, baselines[s].T[:, :, None]) for s in (0, 1))
+    a, c = (_side(_rotated(turns[s], own[2 * s]), middle, baselines[s].T[:, :, None]) for s in (0, 1))
     variances = rays.variances[:, triplet, None]
     by_ray = [a.by_own, a.by_middle - c.by_middle, -c.by_own]
     along, noise = [], []
@@ -206,7 +206,7 @@ def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
     return _Tracks(own, turns, middle, variances, (a, c), by_ray, along, noise, variance, r)
 
 
-def _turned(turns: Array, x: Array) -> Array:
+def _rotated(turns: Array, x: Array) -> Array:
     """Rotated vectors (pieces, 3, length), with the components as first axis."""
     return np.moveaxis(turns @ x, 1, 0)
 
@@ -269,7 +269,7 @@ def _jacobian_and_residuals(at: _Tracks, with_focals: bool) -> Array:
         for k, x in enumerate(at.own):
             depth = x[:, 2:]
             pull = depth * (axis - depth * x)
-            pull = np.moveaxis(pull, 1, 0) if k == 1 else _turned(at.turns[k // 2], pull)
+            pull = np.moveaxis(pull, 1, 0) if k == 1 else _rotated(at.turns[k // 2], pull)
             J[12 + k] = _dot(by_ray[k], pull) + ratio * at.noise[k]
     J[-1] = at.r
     return whole

@@ -16,7 +16,7 @@ from colmap_vg.epipolar.problem import EpipolarProblem
 
 BoolArray = NDArray[np.bool_]
 
-FIRST_STEP, MAX_TERM = 0.06, 0.6
+INITIAL_STEP, MAX_TERM = 0.06, 0.6
 """First step and largest absolute value of the term, dimensionless, at the focal lengths of the problem."""
 NUM_REFINEMENTS = 2
 """Number of parabolas, each with a quarter of the previous step."""
@@ -57,7 +57,7 @@ def fit_radial_term(problem: EpipolarProblem, start: AdjustmentResult, free_radi
             tried[term] = _adjusted(problem.undistorted(term, free_radials), nearest, start.scale_px)
         return tried[term].cost
 
-    center, step = 0.0, FIRST_STEP
+    center, step = 0.0, INITIAL_STEP
     for _ in range(NUM_REFINEMENTS):
         while abs(center) + step <= MAX_TERM and min(cost(center - step), cost(center + step)) < cost(center):
             center += step if cost(center + step) < cost(center - step) else -step

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Metric = Literal["chordal", "orthogonal"]
 
-MIN_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-10, 1.0, 1e8
+MIN_DAMPING, INITIAL_DAMPING, MAX_DAMPING = 1e-10, 1.0, 1e8
 """Damping as shares of each camera's mean curvature. A large initial value keeps the iteration in the basin of the
 initial positions."""
 NEWTON_BELOW = 1e-2
@@ -143,7 +143,7 @@ def minimize_directions(
     problem = _Directions(num_images, edges, directions_world, unit_weights(weights, len(edges)), metric)
     p = centered(initial_centers)
     size = spread(p)
-    cost, damping = problem.cost(p), FIRST_DAMPING
+    cost, damping = problem.cost(p), INITIAL_DAMPING
     at = problem.linearize(p)
     log, stalled = [LogEntry("cle1", 0, cost, at.size)], False
     while at.size > tolerance and len(log) <= max_num_iterations:

@@ -33,7 +33,7 @@ MIN_RELATIVE_LENGTH = 1e-8
 MIN_WEIGHTED_LENGTH = 0.1
 """Lower limit of edge lengths in the weights of 1O and 2O, as a share of the initial median edge length. Unbounded
 weights, one over the squared length, would collapse cameras with inconsistent edges at an increasing rate."""
-REACH_QUANTILE, LEAST_REACH = 0.95, 1.5
+REACH_QUANTILE, MIN_REACH = 0.95, 1.5
 """Largest distance of cameras from the centroid: this quantile of the initial distances, and at least this multiple of
 their root mean square. Cameras that are initially farther away may keep their distance."""
 
@@ -141,7 +141,7 @@ def farthest_allowed(start: Array) -> Array:
     """Largest allowed distance of each camera from the centroid, (n,), from initial positions with centroid 0."""
     distance = np.linalg.norm(start, axis=1)
     rms = float(np.sqrt(np.mean(distance**2)))
-    return np.asarray(np.maximum(distance, max(float(np.quantile(distance, REACH_QUANTILE)), LEAST_REACH * rms)))
+    return np.asarray(np.maximum(distance, max(float(np.quantile(distance, REACH_QUANTILE)), MIN_REACH * rms)))
 
 
 def regauged(p: Array, size: float, reach: Array) -> Array:

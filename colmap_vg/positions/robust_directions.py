@@ -31,7 +31,7 @@ MIN_SCALE = 1e-6
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a vector of two independent standard normal deviates, such as a direction's error in its tangent
 plane."""
-FIRST_DAMPING, MAX_DAMPING = 1.0, 1e8
+INITIAL_DAMPING, MAX_DAMPING = 1.0, 1e8
 """Initial and largest damping, as shares of each camera's mean curvature. A large initial value keeps the iteration in
 the basin of the initial positions."""
 ROUGH_TOLERANCE = 1e-4
@@ -122,7 +122,7 @@ def _minimized(
     problem: "_Problem", p: Array, log: list[LogEntry], max_num_iterations: int, tolerance: float
 ) -> tuple["_Point", float, bool]:
     """Minimise from given positions; return the minimum, the scale of the loss, and whether the cost converged."""
-    at, scale, damping = problem.at(p), np.inf, FIRST_DAMPING
+    at, scale, damping = problem.at(p), np.inf, INITIAL_DAMPING
     for iteration in range(1, max_num_iterations + 1):
         # The scale only decreases, so that the cost decreases from step to step.
         scale = min(scale, max(EFFICIENT_CAUCHY * problem.sigma(at), MIN_SCALE))

@@ -66,7 +66,7 @@ def solve_view_graph(
         if poses is None:
             state.remove_images(solved, ImageVerdict.NOT_RIGID)
         else:
-            state.place(
+            state.record_poses(
                 solved,
                 poses.rotations,
                 poses.centers,

@@ -135,7 +135,7 @@ class SolverState:
         kept[part.edge_rows] = True
         return self.largest_rigid_part(Subgraph.of(self.graph.edges, remaining, kept), seed)
 
-    def place(
+    def record_poses(
         self,
         part: Subgraph,
         rotations: Array,

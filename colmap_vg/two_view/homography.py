@@ -95,19 +95,19 @@ def poses_from_homography(H: Array, offsets: IntArray, bearings1: Array, bearing
     cosine = (1.0 + d1 * d3) / (d1 + d3)
     mean_ray = segment_sums(offsets, bearings1)
     pair = [_decomposition(U, Vt, x1, sign * x3, sign * sine, cosine, mean_ray) for sign in (1.0, -1.0)]
-    judged = [check_cheirality(R, d, offsets, bearings1, bearings2) for R, d, _ in pair]
+    poses = [check_cheirality(R, d, offsets, bearings1, bearings2) for R, d, _ in pair]
     errors = np.stack(
         [
             segment_quantiles(offsets, np.abs(sampson_errors(essential_from_pose(R, d), offsets, bearings1, bearings2)))
             for R, d, _ in pair
         ]
     )
-    swap = judged[1].num_in_front > judged[0].num_in_front
-    swap |= (judged[1].num_in_front == judged[0].num_in_front) & (errors[1] < errors[0])
+    swap = poses[1].num_in_front > poses[0].num_in_front
+    swap |= (poses[1].num_in_front == poses[0].num_in_front) & (errors[1] < errors[0])
     normals = np.stack([n for _, _, n in pair])
     return PlanarPoses(
-        better=_select(judged, swap),
-        alternative=_select(judged, ~swap),
+        better=_select(poses, swap),
+        alternative=_select(poses, ~swap),
         normals=np.where(swap[None, :, None], normals[::-1], normals),
         median_errors=np.where(swap, errors[::-1], errors),
         baseline_ratios=d1 - d3,

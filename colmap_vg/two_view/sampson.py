@@ -224,8 +224,8 @@ def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -
     Q1, Q2 = frames1[edge], frames2[edge]
     columns = matches.pieces.columns[block.pieces]
     focal_ratios = (None, None) if matches.focal_ratios is None else matches.focal_ratios[:, edge]
-    y, depth1 = _turned(Q1, columns[:, :3], focal_ratios[0])
-    z, depth2 = _turned(Q2, columns[:, 3:], focal_ratios[1])
+    y, depth1 = _rotated(Q1, columns[:, :3], focal_ratios[0])
+    z, depth2 = _rotated(Q2, columns[:, 3:], focal_ratios[1])
     v1, v2 = matches.variances[:, edge, None]
     c = z[0] * y[1] - z[1] * y[0]
     squared = c * c
@@ -235,7 +235,7 @@ def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -
     return _AtFrames(edge, Q1, Q2, depth1, depth2, y, z, v1, v2, c, variance, c / np.sqrt(variance))
 
 
-def _turned(Q: Array, x: Array, focal_ratio: Array | None) -> tuple[Array, Array]:
+def _rotated(Q: Array, x: Array, focal_ratio: Array | None) -> tuple[Array, Array]:
     """Coordinates ``Q^T x`` (3, pieces, length) and depths of unit rays (pieces, 3, length) after rescaling."""
     depth = x[:, 2]
     if focal_ratio is None:
