@@ -1,1 +1,1 @@
-"""Focal lengths from matches alone."""
+"""Self-calibration: estimation of focal lengths from matches."""

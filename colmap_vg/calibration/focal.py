@@ -1,7 +1,8 @@
-"""Focal lengths of cameras, voted by the fundamental matrices of all their pairs at once.
+"""Focal lengths of cameras by robust voting over the fundamental matrices of their pairs.
 
-Every pair gives a curve over the focal length (see :mod:`colmap_vg.calibration.focal_curves`); cameras sum saturating
-costs of their pairs on a logarithmic grid, then on a finer one around the best, and take the parabola's minimum.
+Every pair gives a cost curve over the focal length (see :mod:`colmap_vg.calibration.focal_curves`). The robust costs of
+all pairs of a camera are summed on a logarithmic grid, then on a finer grid around the minimum, which a parabola
+refines.
 """
 
 from dataclasses import dataclass
@@ -24,34 +25,34 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_COARSE = np.linspace(LOWEST, HIGHEST, 160)  # steps of 1.8 %
-_FINE = np.linspace(-0.036, 0.036, 41)  # around the coarse minimum, steps of 0.18 %
-_SHIFTS = np.linspace(-0.5, 0.5, 41)  # of all cameras together, between sweeps
-_FITTING_COST = CAUCHY_SCALE**2 * np.log(2.0)  # of a pair three standard deviations off
-_SUPPORTING_RISE = 4.0  # a pair supports a focal if one 25 % away costs it so much more
-_NEARBY = np.log(1.25)
+_COARSE_LOG_FOCALS = np.linspace(LOWEST, HIGHEST, 160)  # log of focal over image size, steps of 1.8 %
+_FINE_SHIFTS = np.linspace(-0.036, 0.036, 41)  # log factor around the coarse minimum, steps of 0.18 %
+_COMMON_SHIFTS = np.linspace(-0.5, 0.5, 41)  # log factor on all cameras together, between sweeps
+_MAX_FITTING_COST = CAUCHY_SCALE**2 * np.log(2.0)  # squared standard deviations; cost of a pair three of them off
+_MIN_SUPPORTING_RISE = 4.0  # squared standard deviations; least cost increase 25 % away for a pair to support a focal
+_NEARBY = np.log(1.25)  # log factor at which support is tested
 
 
 @dataclass(frozen=True, eq=False)
 class FocalEstimates:
-    """Focal lengths voted by pairs.
+    """Focal lengths estimated from fundamental matrices, with their uncertainty and support.
 
     Attributes
     ----------
     focal_lengths : (c,) array
-        Pixels. Cameras without a vote of their own get the common ratio of focal length to image size.
+        Pixels. Cameras without usable pairs get the common ratio of focal length to image size.
     sigmas : (c,) array
-        Standard deviation of the logarithm of the focal length with the other cameras' held, from the cost's curvature;
+        Standard deviation of the log focal length with the other cameras fixed, from the curvature of the cost;
         infinite without a minimum.
     support : (c,) int64 array
-        Pairs of the camera that fit its focal length, and would fit neither one 25 % away nor both cameras' changed
-        together by as much.
+        Number of pairs of the camera that fit its focal length, but neither one 25 % away nor a joint change of both
+        cameras by as much.
     num_pairs : (c,) int64 array
-        All pairs of the camera that had a vote.
+        Number of pairs of the camera with a usable fundamental matrix.
     reliable : (c,) bool array
-        At least `min_support` pairs, and a standard deviation of at most `max_sigma`.
+        Whether at least `min_support` pairs support the focal length and its standard deviation is at most `max_sigma`.
     common_ratio : float
-        The focal length over the longer image side that all pairs vote for as if all cameras shared it.
+        Focal length over the longer image side of best total cost if all cameras share it.
     """
 
     focal_lengths: Array
@@ -64,16 +65,17 @@ class FocalEstimates:
 
 @dataclass(frozen=True, eq=False)
 class FocalAgreement:
-    """Whether given focal lengths agree with the fundamental matrices.
+    """Agreement of given focal lengths with the fundamental matrices.
 
     Attributes
     ----------
     ratios : (c,) array
-        Given over voted focal length.
+        Given over estimated focal length.
     excess_costs : (c,) array
-        Cost at the given focal length less that at the voted one, per supporting pair; 0 without support.
+        Cost at the given minus cost at the estimated focal length, per supporting pair, squared standard deviations;
+        0 without support.
     contradicted : (c,) bool array
-        The vote is reliable, the ratio is outside the tolerance, and the pairs pay for it.
+        Whether the estimate is reliable, the ratio is outside the tolerance, and the excess cost above its threshold.
     estimates : FocalEstimates
     """
 
@@ -96,34 +98,34 @@ def vote_focal_lengths(
     max_sigma: float = 0.03,
     num_sweeps: int = 20,
 ) -> FocalEstimates:
-    """Focal length of each camera from the fundamental matrices of its pairs.
+    """Estimate the focal length of each camera from the fundamental matrices of its pairs.
 
-    All cameras are first taken to share one ratio of focal length to image size; then each follows its own pairs while
-    the others hold, in damped sweeps, between which all move together.
+    All cameras start from one common ratio of focal length to image size. Damped sweeps then minimise the cost of each
+    camera with the others fixed; after each sweep all focal lengths are scaled by a common factor of least total cost.
 
     Parameters
     ----------
     F : (m, 3, 3) array
-        Fundamental matrices on undistorted pixels, ``x2^T F x1 = 0``, of any scale. Rows with NaN have no vote.
+        Fundamental matrices on undistorted pixels, ``x2^T F x1 = 0``, of any scale. Rows with NaN are ignored.
     edges : (m, 2) int array
         Camera rows of each pair (not image rows); equal for two images of one camera.
     principal_points : (c, 2) array
         Pixels.
     image_sizes : (c,) or (c, 2) array
-        Pixels; of two, the larger counts.
+        Pixels; of width and height the larger is used.
     covariances : (m, 9, 9) array, optional
-        Of the row-major ``vec(F)``, from `fundamental_covariances`. Strongly advised: without them planar pairs count
-        as much as others.
+        Covariances of the row-major ``vec(F)``, from `fundamental_covariances`. Recommended: without them planar pairs,
+        which do not determine the focal length, have the same weight as others.
     num_inliers : (m,) array, optional
-        Matches of each pair, used only without `covariances`; 100 where missing.
+        Number of matches of each pair, used only without `covariances`. Default: 100.
     aspect_ratios : (c,) array, optional
-        Vertical over horizontal focal length; 1 where missing. The focal length returned is the horizontal one.
+        Vertical over horizontal focal length. Default: 1. The focal length returned is the horizontal one.
     min_support : int
         See `FocalEstimates`.
     max_sigma : float
         See `FocalEstimates`.
     num_sweeps : int
-        Most sweeps over the cameras, when there are several.
+        Maximum number of sweeps if there are several cameras.
 
     Returns
     -------
@@ -132,7 +134,7 @@ def vote_focal_lengths(
     Raises
     ------
     GraphError
-        No pair has a fundamental matrix, or a row points outside the cameras.
+        No pair has a finite fundamental matrix, or an edge has a camera row out of range.
     """
     size = _sizes(image_sizes)
     curves = focal_curves(F, edges, principal_points, size, covariances, num_inliers, aspect_ratios)
@@ -156,7 +158,7 @@ def focal_agreement(
     tolerance: float = 0.05,
     min_excess_cost: float = 1.0,
 ) -> FocalAgreement:
-    """Whether given focal lengths can be trusted: their cost against that of the voted ones.
+    """Compare given focal lengths with those estimated from the fundamental matrices.
 
     Parameters
     ----------
@@ -165,9 +167,9 @@ def focal_agreement(
     F, edges, principal_points, image_sizes, covariances, num_inliers, aspect_ratios, min_support, max_sigma, num_sweeps
         As for :func:`vote_focal_lengths`.
     tolerance : float
-        Relative difference that is never held against a given focal length; the vote's own error is part of it.
+        Largest relative difference that is accepted in any case; it includes the error of the estimate.
     min_excess_cost : float
-        Cost per supporting pair, in units of squared standard deviations.
+        Excess cost per supporting pair above which the given focal length is contradicted, squared standard deviations.
 
     Returns
     -------
@@ -177,7 +179,7 @@ def focal_agreement(
     curves = focal_curves(F, edges, principal_points, size, covariances, num_inliers, aspect_ratios)
     found, sides = _vote(curves, size, min_support, max_sigma, num_sweeps)
     log_given, log_found = np.log(focal_lengths / size), np.log(found.focal_lengths / size)
-    # Only the camera in question moves; the others stay at the vote.
+    # Only the focal length of the camera in question changes; the others stay at their estimates.
     at_given, at_found = (sides.costs(at[sides.camera][:, None], log_found)[:, 0] for at in (log_given, log_found))
     excess = sum_at_nodes(len(size), sides.camera, at_given - at_found)
     excess = np.where(found.support > 0, excess / np.maximum(found.support, 1), 0.0)
@@ -190,7 +192,7 @@ def _vote(
     curves: FocalCurves, size: Array, min_support: int, max_sigma: float, num_sweeps: int
 ) -> tuple[FocalEstimates, FocalCurves]:
     c = len(size)
-    # First as if all cameras had one ratio of focal to size: the majority's, and right for most folders.
+    # Start from one ratio of focal length to image size for all cameras, which is right for most image folders.
     common, _ = _minimized(curves_of_one_camera(curves), np.zeros(1))
     log_focals = np.full(c, common[0])
     sides = curves_of_each_camera(curves, log_focals)
@@ -198,7 +200,7 @@ def _vote(
     sigmas = np.full(c, np.inf)
     for _ in range(num_sweeps if several else 1):
         best, sigmas = _minimized(sides, log_focals)
-        # Two cameras' focals are mostly known as a product: full steps of both would overshoot.
+        # Pairs of two cameras determine mostly the product of their focals: full steps of both would overshoot.
         step = np.where(np.isfinite(sigmas), best - log_focals, 0.0) * (0.6 if several else 1.0)
         if several:
             step = step + _common_shift(sides, log_focals + step)
@@ -213,26 +215,28 @@ def _vote(
 
 
 def _minimized(curves: FocalCurves, log_focals: Array) -> tuple[Array, Array]:
-    """Best log focal of each camera with the others held, and its standard deviation: (c,), (c,)."""
+    """Best log focal of each camera with the others fixed, and its standard deviation: (c,), (c,)."""
     c, o = len(log_focals), len(curves.camera)
-    total = sum_at_nodes(c, curves.camera, curves.costs(np.broadcast_to(_COARSE, (o, len(_COARSE))), log_focals))
-    center = _COARSE[np.argmin(total, axis=1)]
-    fine = center[:, None] + _FINE
+    total = sum_at_nodes(
+        c, curves.camera, curves.costs(np.broadcast_to(_COARSE_LOG_FOCALS, (o, len(_COARSE_LOG_FOCALS))), log_focals)
+    )
+    center = _COARSE_LOG_FOCALS[np.argmin(total, axis=1)]
+    fine = center[:, None] + _FINE_SHIFTS
     total = sum_at_nodes(c, curves.camera, curves.costs(fine[curves.camera], log_focals))
-    row, k = np.arange(c), np.clip(np.argmin(total, axis=1), 1, len(_FINE) - 2)
+    row, k = np.arange(c), np.clip(np.argmin(total, axis=1), 1, len(_FINE_SHIFTS) - 2)
     before, at, after = total[row, k - 1], total[row, k], total[row, k + 1]
-    bend, width = before - 2.0 * at + after, _FINE[1] - _FINE[0]
-    inside = (bend > 0) & (at <= before) & (at <= after) & (center > LOWEST) & (center < HIGHEST)
-    shift = np.where(inside, 0.5 * (before - after) / np.where(inside, bend, 1.0), 0.0)
+    curvature, width = before - 2.0 * at + after, _FINE_SHIFTS[1] - _FINE_SHIFTS[0]
+    inside = (curvature > 0) & (at <= before) & (at <= after) & (center > LOWEST) & (center < HIGHEST)
+    shift = np.where(inside, 0.5 * (before - after) / np.where(inside, curvature, 1.0), 0.0)
     # The cost is a chi-square: twice its inverse second derivative is the variance.
-    sigma = np.where(inside, width * np.sqrt(2.0 / np.where(inside, bend, 1.0)), np.inf)
+    sigma = np.where(inside, width * np.sqrt(2.0 / np.where(inside, curvature, 1.0)), np.inf)
     return fine[row, k] + width * shift, sigma
 
 
 def _common_shift(curves: FocalCurves, log_focals: Array) -> float:
-    """Change of all cameras together that costs least: what sweeps over single cameras are slow to find."""
+    """Change of all log focals together of least total cost, which sweeps over single cameras are slow to find."""
     shift = 0.0
-    for grid in (_SHIFTS, _FINE):
+    for grid in (_COMMON_SHIFTS, _FINE_SHIFTS):
         shifted = log_focals[:, None] + (shift + grid)
         shift += float(grid[np.argmin(curves.costs(shifted[curves.camera], shifted).sum(axis=0))])
     return shift
@@ -241,10 +245,10 @@ def _common_shift(curves: FocalCurves, log_focals: Array) -> float:
 def _support(curves: FocalCurves, log_focals: Array) -> IntArray:
     at = log_focals[curves.camera][:, None]
     cost = curves.costs(at + np.array([0.0, -_NEARBY, _NEARBY]), log_focals)
-    # With the other camera held a pair may know the product of two focals only: it must also see both change together.
+    # A pair may determine the product of two focals only: require that a joint change of both is rejected, too.
     joint = [curves.costs(at + shift, log_focals + shift)[:, 0] for shift in (-_NEARBY, _NEARBY)]
     lowest = np.minimum(cost[:, 1:].min(axis=1), np.minimum(*joint))
-    supports = (cost[:, 0] <= _FITTING_COST) & (lowest >= cost[:, 0] + _SUPPORTING_RISE)
+    supports = (cost[:, 0] <= _MAX_FITTING_COST) & (lowest >= cost[:, 0] + _MIN_SUPPORTING_RISE)
     return np.bincount(curves.camera[supports], minlength=len(log_focals)).astype(np.int64)
 
 

@@ -1,9 +1,9 @@
-"""How far each pair's essential matrix is from having two equal singular values, as a curve over one camera's focal.
+"""Difference of the singular values of each pair's essential matrix, as a function of one camera's focal length.
 
 With the right focal lengths ``E = K2^T F K1`` has two equal singular values (Huang & Faugeras 1989; as a cost over the
 focal: Mendonça & Cipolla 1999). Each pair gives ``h = (s1 - s2) / (s1 + s2)`` with its standard deviation, propagated
-from the covariance of F: a pair that cannot know the focal (planar, or optical axes that meet at equal distances) has a
-large one and no say.
+from the covariance of F: pairs that do not determine the focal (planar scenes, or optical axes that meet at equal
+distances) have a large one and hardly any weight.
 
 The curves need no SVD: for rank two ``s1^2 + s2^2 = ||E||^2`` and ``s1 s2 = ||cof E||``, both polynomials in the
 squared focals with sums of squares of F and of its cofactors as coefficients. Focals are in units of the image size.
@@ -23,26 +23,27 @@ BoolArray = NDArray[np.bool_]
 
 LOWEST, HIGHEST = float(np.log(0.3)), float(np.log(5.0))  # log focal over image size: 118° to 11° of view
 CAUCHY_SCALE = 3.0  # standard deviations
-_NODES = np.linspace(LOWEST, HIGHEST, 10)  # of the standard deviations, which are smooth in log f
-_DEFAULT_SIGMA = 2e-3  # of vec(F) of one match, image sizes and ||F|| being 1; where no covariance is given
+_NODES = np.linspace(LOWEST, HIGHEST, 10)  # log focals; the standard deviations, smooth in log f, are interpolated
+_DEFAULT_SIGMA = 2e-3  # of vec(F) per match without covariances, dimensionless: image sizes and ||F|| are 1
 _DEFAULT_MATCHES = 100
 
 
 @dataclass(frozen=True, eq=False)
 class FocalCurves:
-    """Curves of h over the logarithm of a focal, one for each pair and camera that varies.
+    """Functions h of a log focal, one for each pair and each of its cameras whose focal varies.
 
     Attributes
     ----------
     camera : (o,) int64 array
-        The camera that varies.
+        The camera whose focal varies.
     cameras : (o, 2) int64 array
         Cameras of the pair's two sides.
     F : (o, 3, 3) array
         Fundamental matrices in units of the image sizes, principal points at zero.
     covariances : (o, 9, 9) array
+        Covariances of the row-major ``vec(F)``.
     log_sd : (o, nodes) array
-        Logarithm of the standard deviation of h.
+        Logarithm of the standard deviation of h at the log focals of the nodes.
     """
 
     camera: IntArray
@@ -53,22 +54,22 @@ class FocalCurves:
 
     @property
     def varies(self) -> BoolArray:
-        """Sides whose focal varies, (o, 2)."""
+        """Mask (o, 2) of the sides whose focal varies."""
         return np.asarray(self.cameras == self.camera[:, None])
 
     def costs(self, log_f: Array, log_focals: Array) -> Array:
-        """``c^2 log(1 + h^2 / (c sd)^2)`` at log_f (o, g) of the camera that varies, (o, g).
+        """Robust costs ``c^2 log(1 + h^2 / (c sd)^2)`` at log focals log_f (o, g) of the varying camera: (o, g).
 
-        The others are held at log_focals, (n,), or (n, g) where they differ between the columns.
+        The other cameras are fixed at log_focals, (n,), or (n, g) where they differ between the columns.
         """
         deviation = self.deviations(log_f, log_focals)
         sd = np.exp(_interpolated(self.log_sd, log_f))
         return np.asarray(CAUCHY_SCALE**2 * np.log1p(np.square(deviation / (CAUCHY_SCALE * sd))))
 
     def deviations(self, log_f: Array, log_focals: Array) -> Array:
-        """``h = (s1 - s2) / (s1 + s2)`` at log_f (o, g) of the camera that varies: (o, g)."""
-        held = (log_focals[:, None] if log_focals.ndim == 1 else log_focals)[self.cameras]
-        f1, f2 = (np.exp(2.0 * np.where(self.varies[:, s, None], log_f, held[:, s])) for s in (0, 1))
+        """``h = (s1 - s2) / (s1 + s2)`` at log focals log_f (o, g) of the varying camera: (o, g)."""
+        log_fixed = (log_focals[:, None] if log_focals.ndim == 1 else log_focals)[self.cameras]
+        f1, f2 = (np.exp(2.0 * np.where(self.varies[:, s, None], log_f, log_fixed[:, s])) for s in (0, 1))
         n = _sums_of_squares(self.F)[:, :, None]
         k = _sums_of_squares(cofactors(self.F))[:, :, None]
         both = f1 * f2
@@ -87,22 +88,22 @@ def focal_curves(
     num_inliers: IntArray | None = None,
     aspect_ratios: Array | None = None,
 ) -> FocalCurves:
-    """One curve for each pair, its first camera varying, as if both sides were that camera.
+    """One curve for each pair, over the focal of its first camera, with deviations as if both cameras had that focal.
 
     Parameters are those of :func:`colmap_vg.calibration.focal.vote_focal_lengths`, with sizes (c,).
 
     Raises
     ------
     GraphError
-        An edge names a camera that does not exist, or no fundamental matrix is finite.
+        An edge has a camera row out of range, or no fundamental matrix is finite.
     """
     if len(edges) and (edges.min() < 0 or edges.max() >= len(sizes)):
-        raise GraphError(f"edges name camera rows {edges.min()} to {edges.max()}, but there are {len(sizes)} cameras")
+        raise GraphError(f"edges have camera rows {edges.min()} to {edges.max()}, but there are {len(sizes)} cameras")
     use = np.isfinite(F).all(axis=(1, 2)) & (np.abs(F).max(axis=(1, 2), initial=0.0) > 0)
     if covariances is not None:
         use &= np.isfinite(covariances).all(axis=(1, 2))
     if not use.any():
-        raise GraphError("no pair has a fundamental matrix to vote for a focal length with: verify the matches first")
+        raise GraphError("no pair has a fundamental matrix to estimate focal lengths from: verify the matches first")
     aspect = np.ones(len(sizes)) if aspect_ratios is None else aspect_ratios
     frames = np.zeros((len(sizes), 3, 3))
     frames[:, 0, 0], frames[:, 1, 1], frames[:, 2, 2] = sizes, sizes * aspect, 1.0
@@ -131,7 +132,7 @@ def curves_of_one_camera(curves: FocalCurves) -> FocalCurves:
 
 
 def curves_of_each_camera(curves: FocalCurves, log_focals: Array) -> FocalCurves:
-    """Pairs of two cameras twice, each varying in turn, with standard deviations at the other's focal (n,)."""
+    """Curves over the focal of each camera: two for pairs of two cameras, with the other log focal fixed (n,)."""
     first, second = curves.cameras.T
     mixed = first != second
     if not mixed.any():
@@ -152,8 +153,8 @@ def curves_of_each_camera(curves: FocalCurves, log_focals: Array) -> FocalCurves
 def _standard_deviations(F: Array, covariances: Array, f1: Array | float, f2: Array | float) -> Array:
     """Standard deviation of h from that of F, (m,).
 
-    In the axes of E's singular vectors its upper 2x2 block is ``diag(s1, s2)``; it is a multiple of a rotation where
-    ``((B11 - B22), (B12 + B21)) / (s1 + s2)`` vanishes. The information of that pair along the first is what h has.
+    In the axes of E's singular vectors its upper 2x2 block B is ``diag(s1, s2)``; it is a multiple of a rotation where
+    ``((B11 - B22), (B12 + B21)) / (s1 + s2)`` vanishes. The information of h is that of the pair along its first.
     """
     m = len(F)
     d1, d2 = (np.stack([np.broadcast_to(f, m), np.broadcast_to(f, m), np.ones(m)], axis=1) for f in (f1, f2))
@@ -176,7 +177,7 @@ def _standard_deviations(F: Array, covariances: Array, f1: Array | float, f2: Ar
 
 
 def _sums_of_squares(M: Array) -> Array:
-    """Sums over the upper left block, the last column, the last row and the corner of M squared: (m, 4)."""
+    """Sums of the squares of M over the upper left 2x2 block, the last column, the last row and the corner: (m, 4)."""
     S = np.square(M)
     return np.stack(
         [S[:, :2, :2].sum(axis=(1, 2)), S[:, :2, 2].sum(axis=1), S[:, 2, :2].sum(axis=1), S[:, 2, 2]], axis=1
@@ -184,7 +185,7 @@ def _sums_of_squares(M: Array) -> Array:
 
 
 def _interpolated(at_nodes: Array, log_f: Array) -> Array:
-    """Linear interpolation of each row (o, nodes) at its own places (o, g), constant beyond the ends."""
+    """Linear interpolation of each row (o, nodes) at its own log focals (o, g), constant beyond the ends."""
     last = len(_NODES) - 1
     place = np.clip((log_f - LOWEST) / (HIGHEST - LOWEST), 0.0, 1.0) * last
     low = np.minimum(place.astype(np.int64), last - 1)

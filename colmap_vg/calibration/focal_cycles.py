@@ -1,11 +1,11 @@
-"""The focal length at which relative rotations close around cycles, for scenes whose single pairs cannot know it.
+"""Focal length from the cycle consistency of relative rotations, for scenes whose single pairs do not determine it.
 
-On a turntable, where optical axes meet at equal distances, any focal gives each pair an essential matrix, and only its
-rotation angle changes. The angles of several pairs still have to agree: with a wrong focal, rotations around cycles of
-the view graph do not close. For each focal on a grid, relative poses are taken from the fundamental matrices, refined
-for a few steps, averaged robustly, and the residual angles ``r`` are compared with what each edge knows of its
-rotation: ``c^2 log(1 + r^2 / (c^2 (v + s^2)))``, summed, ``v`` the mean variance of the edge's three rotation
-parameters. The minimum is refined on finer grids and by a parabola.
+On a turntable, where optical axes meet at equal distances, every focal length gives each pair a valid essential matrix;
+only the rotation angle changes. The angles of several pairs still have to be consistent: with a wrong focal length,
+rotations around cycles of the view graph do not compose to the identity. For each focal length on a grid, relative
+poses are computed from the fundamental matrices, refined for a few steps and averaged robustly. The cost is the sum of
+``c^2 log(1 + r^2 / (c^2 (v + s^2)))`` with the residual angles ``r``, the mean variance ``v`` of the three rotation
+parameters of each edge, and the model error ``s``. The minimum is refined on finer grids and by a parabola.
 """
 
 from dataclasses import dataclass
@@ -25,34 +25,35 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_COARSE = np.linspace(np.log(0.4), np.log(4.5), 15)  # steps of 19 %
-_FINER = (0.06, 0.02)  # half the step of the coarse grid and of the one after it: what the finer grids step by
-_NUM_FINER = 3  # finer values on each side
+_COARSE_LOG_FACTORS = np.linspace(np.log(0.4), np.log(4.5), 15)  # steps of 19 %
+_FINE_STEPS = (0.06, 0.02)  # log factor; steps of the two finer grids, about a third of the step before
+_NUM_FINE = 3  # values of a finer grid on each side of the minimum
 _MATCHES_PER_PAIR = 100
-_NUM_STEPS = 6  # Levenberg steps from the nearest essential matrix: it starts within a few sigma
+_NUM_STEPS = 6  # Levenberg-Marquardt steps; the nearest essential matrix is within a few standard deviations
 _CAUCHY_SCALE = 3.0  # standard deviations
-_MODEL_SIGMA = 1e-3  # radians; lens model and correlated keypoints beside the matches' own noise
-_GATE_DEG = 2.0  # degrees, of the robust averaging
-_SIDE = np.log(1.25)
-_CHECKED_SHIFT = 0.1
+_MODEL_SIGMA = 1e-3  # radians; error of the lens model and correlation of keypoints, beside the noise of the matches
+_AVERAGING_SIGMA_DEG = 2.0  # degrees; scale of the robust rotation averaging
+_SIDE = np.log(1.25)  # log factor at which the rise of the cost is measured
+_CHECKED_SHIFT = 0.1  # log factor at which given focal lengths are compared
 
 
 @dataclass(frozen=True, eq=False)
 class CycleVote:
-    """The focal length that closes rotations around cycles.
+    """Focal lengths of best cycle consistency, with the cost curve.
 
     Attributes
     ----------
     factor : float
-        On the unit focal lengths of the cameras asked, shared by them.
+        Common factor on the unit focal lengths of the estimated cameras.
     focal_lengths : (c,) array
-        Pixels; those of cameras not asked as they were.
+        Pixels; unchanged for the other cameras.
     log_factors, costs : (g,) array
-        The curve that was found: sums of saturating squared residuals, in squared standard deviations.
+        The evaluated cost curve: sums of robust squared residuals, in squared standard deviations.
     rise : float
         Cost 25 % away, on the side where it is lower, over the cost at the minimum.
     reliable : bool
-        The minimum lies inside the range, the curve rises by a tenth and by 9 on both sides, and the graph has cycles.
+        Whether the minimum is inside the range, the cost 25 % away on both sides is more than a tenth and more than 9
+        above it, and the graph has at least three independent cycles.
     """
 
     factor: float
@@ -65,7 +66,21 @@ class CycleVote:
 
 @dataclass(frozen=True, eq=False)
 class CyclePairs:
-    """Pairs of the largest component, their images renumbered, with a spread of their matches."""
+    """Pairs of the largest connected component, with a subsample of their matches.
+
+    Attributes
+    ----------
+    num_images : int
+    images : (m, 2) int64 array
+        Images of each pair, renumbered from zero.
+    cameras : (m, 2) int array
+        Camera rows of each pair.
+    F : (m, 3, 3) array
+        Fundamental matrices on undistorted pixels.
+    offsets : (m + 1,) int64 array
+    points1, points2 : (k, 2) array
+        Matched keypoints, undistorted pixels.
+    """
 
     num_images: int
     images: IntArray
@@ -77,23 +92,24 @@ class CyclePairs:
 
 
 def vote_focal_by_rotation_cycles(
-    pairs: CyclePairs, unit_focal_lengths: Array, aspect_ratios: Array, principal_points: Array, asked: BoolArray
+    pairs: CyclePairs, unit_focal_lengths: Array, aspect_ratios: Array, principal_points: Array, estimated: BoolArray
 ) -> CycleVote:
-    """Common factor on the focal lengths of the cameras asked at which relative rotations agree best.
+    """Estimate the common factor on the focal lengths of some cameras at which rotation cycles are most consistent.
 
-    For cameras that :func:`colmap_vg.calibration.focal.vote_focal_lengths` calls unreliable.
+    Intended for cameras whose estimates by :func:`colmap_vg.calibration.focal.vote_focal_lengths` are not reliable.
 
     Parameters
     ----------
     pairs : CyclePairs
     unit_focal_lengths : (c,) array
-        Pixels: for cameras asked what the factor applies to, such as the longer image side; for others their focal
-        length.
+        Pixels. For cameras to estimate the length that the factor multiplies, such as the longer image side; for the
+        others their focal length.
     aspect_ratios : (c,) array
         Vertical over horizontal focal length.
     principal_points : (c, 2) array
         Pixels.
-    asked : (c,) bool array
+    estimated : (c,) bool array
+        Cameras whose focal length is estimated.
 
     Returns
     -------
@@ -101,25 +117,25 @@ def vote_focal_by_rotation_cycles(
     """
 
     def cost(log_factor: float) -> float:
-        focal = unit_focal_lengths * np.where(asked, np.exp(log_factor), 1.0)
+        focal = unit_focal_lengths * np.where(estimated, np.exp(log_factor), 1.0)
         return _cycle_cost(pairs, focal, focal * aspect_ratios, principal_points)
 
-    curve = {float(x): cost(float(x)) for x in _COARSE}
-    for step in _FINER:
+    curve = {float(x): cost(float(x)) for x in _COARSE_LOG_FACTORS}
+    for step in _FINE_STEPS:
         center = min(curve, key=lambda x: curve[x])
-        around = center + step * np.arange(-_NUM_FINER, _NUM_FINER + 1)
+        around = center + step * np.arange(-_NUM_FINE, _NUM_FINE + 1)
         curve.update({float(x): cost(float(x)) for x in around if float(x) not in curve})
     x = np.array(sorted(curve))
     y = np.array([curve[v] for v in x])
     log_factor, lowest = _parabola(x, y)
     sides = np.interp([log_factor - _SIDE, log_factor + _SIDE], x, y)
     num_cycles = len(pairs.images) - pairs.num_images + 1
-    inside = _COARSE[0] < log_factor < _COARSE[-1]
+    inside = _COARSE_LOG_FACTORS[0] < log_factor < _COARSE_LOG_FACTORS[-1]
     rises = sides.min() > 1.1 * lowest and sides.min() > lowest + 9.0
     factor = float(np.exp(log_factor))
     return CycleVote(
         factor,
-        unit_focal_lengths * np.where(asked, factor, 1.0),
+        unit_focal_lengths * np.where(estimated, factor, 1.0),
         x,
         y,
         float(sides.min() / max(lowest, 1e-300)),
@@ -128,13 +144,13 @@ def vote_focal_by_rotation_cycles(
 
 
 def focal_fits_cycles(
-    pairs: CyclePairs, focal_lengths: Array, aspect_ratios: Array, principal_points: Array, asked: BoolArray
+    pairs: CyclePairs, focal_lengths: Array, aspect_ratios: Array, principal_points: Array, estimated: BoolArray
 ) -> bool:
-    """Whether neither longer nor shorter focal lengths of the cameras asked close rotations better: three costs only.
+    """Whether neither 10 % longer nor 10 % shorter focal lengths of some cameras make rotation cycles more consistent.
 
     Parameters
     ----------
-    pairs, aspect_ratios, principal_points, asked
+    pairs, aspect_ratios, principal_points, estimated
         As for :func:`vote_focal_by_rotation_cycles`.
     focal_lengths : (c,) array
         Pixels.
@@ -143,14 +159,14 @@ def focal_fits_cycles(
     -------
     bool
     """
-    factors = [np.where(asked, np.exp(shift), 1.0) for shift in (0.0, -_CHECKED_SHIFT, _CHECKED_SHIFT)]
+    factors = [np.where(estimated, np.exp(shift), 1.0) for shift in (0.0, -_CHECKED_SHIFT, _CHECKED_SHIFT)]
     at, shorter, longer = (
         _cycle_cost(pairs, focal_lengths * f, focal_lengths * f * aspect_ratios, principal_points) for f in factors
     )
     return min(shorter, longer) >= at
 
 
-def chosen_pairs(
+def select_cycle_pairs(
     F: Array,
     edges: IntArray,
     camera_idx: IntArray,
@@ -161,12 +177,12 @@ def chosen_pairs(
     max_num_pairs: int = 1000,
     min_num_matches: int = 30,
 ) -> CyclePairs | None:
-    """The pairs that rotation cycles are looked for in; None where they connect fewer than three images.
+    """Select the pairs for :func:`vote_focal_by_rotation_cycles`; None if they connect fewer than three images.
 
     Parameters
     ----------
     F : (m, 3, 3) array
-        Fundamental matrices on undistorted pixels, ``x2^T F x1 = 0``. Pairs with NaN are left out.
+        Fundamental matrices on undistorted pixels, ``x2^T F x1 = 0``. Pairs with NaN are ignored.
     edges : (m, 2) int array
         Image rows of each pair.
     camera_idx : (n,) int array
@@ -175,9 +191,9 @@ def chosen_pairs(
     points1, points2 : (k, 2) array
         Matched keypoints, pixels.
     max_num_pairs : int
-        Pairs with most matches that are used.
+        Maximum number of pairs; those with most matches are used.
     min_num_matches : int
-        Pairs with fewer are left out.
+        Pairs with fewer matches are ignored.
 
     Returns
     -------
@@ -228,17 +244,17 @@ def _cycle_cost(pairs: CyclePairs, focal_x: Array, focal_y: Array, principal_poi
         focal_x[second],
         num_iterations=_NUM_STEPS,
     )
-    # Unobservable directions get a standard deviation of a radian instead of an infinite one.
+    # Unobservable parameters get a standard deviation of a radian instead of an infinite one.
     covariance = np.linalg.inv(refined.information + np.eye(5))[:, :3, :3]
-    # One variance per edge: full covariances gave the axes that are known best too much say over a model that is not
-    # that good (temple, 2 instead of 3 % off with one).
+    # One variance per edge: full covariances overweight the best-known axes, whose errors the model error dominates (on
+    # temple the focal length was 3 % off with full covariances, 2 % with one variance).
     weights = 1.0 / (np.trace(covariance, axis1=1, axis2=2) / 3.0 + _MODEL_SIGMA**2)
     averaged = average_rotations_robust(
         pairs.num_images,
         pairs.images,
         refined.rotations,
         weights / np.median(weights),
-        sigma_deg=_GATE_DEG,
+        sigma_deg=_AVERAGING_SIGMA_DEG,
         adapt_sigma=False,
     ).cam_from_world_rotations
     solved = averaged[pairs.images[:, 1]] @ np.swapaxes(averaged[pairs.images[:, 0]], 1, 2)
@@ -248,7 +264,7 @@ def _cycle_cost(pairs: CyclePairs, focal_x: Array, focal_y: Array, principal_poi
 
 
 def _parabola(x: Array, y: Array) -> tuple[float, float]:
-    """Place and value of the minimum of a least-squares parabola through the five lowest neighbours."""
+    """Location and value of the minimum of a least-squares parabola through the points around the lowest one."""
     k = int(np.argmin(y))
     near = slice(max(k - 2, 0), k + 3)
     quadratic, linear, constant = np.polyfit(x[near] - x[k], y[near], 2) if len(x[near]) > 2 else (0.0, 0.0, y[k])

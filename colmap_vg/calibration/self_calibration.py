@@ -1,4 +1,4 @@
-"""Focal lengths of a whole database from its matches alone: pairs vote, and where they cannot, rotation cycles do."""
+"""Self-calibration: focal lengths of all cameras from matches, by fundamental matrices or by rotation cycles."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.calibration.focal import FocalAgreement, focal_agreement
-from colmap_vg.calibration.focal_cycles import CycleVote, chosen_pairs, focal_fits_cycles, vote_focal_by_rotation_cycles
+from colmap_vg.calibration.focal_cycles import (
+    CycleVote,
+    focal_fits_cycles,
+    select_cycle_pairs,
+    vote_focal_by_rotation_cycles,
+)
 from colmap_vg.errors import GraphError
 from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
 from colmap_vg.two_view.fundamental_covariance import fundamental_covariances
@@ -17,24 +22,26 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 CYCLE_TOLERANCE = 0.08
-"""Relative difference from the cycles' vote that is not held against a given focal length: several of its errors."""
+"""Relative difference from the cycles' estimate up to which a given focal length is kept: several times its error."""
 
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """Focal lengths found from matches, and what they were found by.
+    """Focal lengths after self-calibration, with the estimates that they are based on.
 
     Attributes
     ----------
     focal_lengths : (c,) array
-        Pixels: the given one where it is not contradicted; else the pairs' vote where it is reliable, else the cycles'.
+        Pixels: the given one unless it is contradicted; else the estimate from fundamental matrices if it is reliable;
+        else that from rotation cycles.
     found : (c,) bool array
-        The focal length is the matches', not the given one.
+        Whether the focal length was estimated from matches rather than given.
     decided : (c,) bool array
-        A vote confirmed or replaced the focal length; elsewhere the matches do not know.
+        Whether an estimate confirmed or replaced the focal length; elsewhere the matches do not determine it.
     by_pairs : FocalAgreement
+        Estimates from fundamental matrices.
     by_cycles : CycleVote or None
-        None where the pairs' vote sufficed, or given focal lengths close the cycles.
+        Estimate from rotation cycles; None if fundamental matrices sufficed or given focal lengths are consistent.
     """
 
     focal_lengths: Array
@@ -61,10 +68,10 @@ def estimate_focal_lengths(
     max_effective_matches: float = 100.0,
     num_iterations: int = 5,
 ) -> SelfCalibration:
-    """Focal length of every camera from verified matches, whatever focal length they were verified under.
+    """Estimate the focal length of every camera from verified matches.
 
-    Fundamental matrices are refitted to the matches, so that neither a wrong focal length nor the sampling of a RANSAC
-    is left in them.
+    Fundamental matrices are refitted to the matches, so that the result depends neither on the focal lengths used for
+    verification nor on the random samples of RANSAC.
 
     Parameters
     ----------
@@ -76,25 +83,25 @@ def estimate_focal_lengths(
     points1, points2 : (k, 2) array
         Matched keypoints in undistorted pixels.
     focal_lengths : (c,) array
-        Pixels, given or guessed.
+        Given or guessed focal lengths, pixels.
     principal_points : (c, 2) array
         Pixels.
     image_sizes : (c,) or (c, 2) array
         Pixels.
     given : (c,) bool array, optional
-        Cameras whose focal length was given, by EXIF or the user: it falls only to a vote that contradicts it, a guess
-        to any reliable vote. Missing: none.
+        Cameras whose focal length was given, by EXIF or the user: it is replaced only by an estimate that contradicts
+        it, a guess by any reliable estimate. Default: none.
     lens_groups : (c,) int array, optional
         Equal for cameras that probably have one lens. Where the pairs of one of them decide its focal length, rotation
-        cycles are not asked for the others, which then stay undecided. Missing: each camera has its own.
+        cycles are not used for the others, which then stay undecided. Default: each camera has its own.
     aspect_ratios : (c,) array, optional
-        Vertical over horizontal focal length; 1 where missing.
+        Vertical over horizontal focal length. Default: 1.
     min_num_matches : int
-        Pairs with fewer are left out.
+        Pairs with fewer matches are ignored.
     max_effective_matches : float
-        See `fundamental_covariances`; what the lens model leaves out does not average away.
+        See `fundamental_covariances`.
     num_iterations : int
-        Reweighting rounds of the refits.
+        Number of reweighting iterations of the refits.
 
     Returns
     -------
@@ -109,7 +116,7 @@ def estimate_focal_lengths(
     used = np.flatnonzero(np.diff(offsets) >= max(min_num_matches, 8))
     if not len(used):
         raise GraphError(
-            f"no pair has the {min_num_matches} matches it takes to vote for a focal length: give the focal length"
+            f"no pair has the {min_num_matches} matches needed to estimate a focal length: give the focal length"
         )
     rows, of_used = rows_of_segments(offsets, used)
     p1, p2 = points1[rows], points2[rows]
@@ -128,27 +135,27 @@ def estimate_focal_lengths(
     found = np.where(given, votes.contradicted, reliable).astype(bool)
     focal = np.where(found, by_pairs.focal_lengths, focal_lengths)
     by_cycles, decided = None, reliable.copy()
-    # A camera without pairs is not decided by what other cameras' cycles say.
-    asked = ~reliable & (by_pairs.num_pairs > 0)
+    # Cycles of other cameras do not determine the focal length of a camera without pairs.
+    undecided = ~reliable & (by_pairs.num_pairs > 0)
     if lens_groups is not None:
-        asked &= given | ~np.isin(lens_groups, lens_groups[reliable & ~given])
-    pairs = chosen_pairs(F, edges[used], camera_idx, of_used, p1, p2) if asked.any() else None
+        undecided &= given | ~np.isin(lens_groups, lens_groups[reliable & ~given])
+    pairs = select_cycle_pairs(F, edges[used], camera_idx, of_used, p1, p2) if undecided.any() else None
     if pairs is not None:
         aspect = np.ones(len(focal)) if aspect_ratios is None else aspect_ratios
-        guessed = asked & ~given
+        guessed = undecided & ~given
         if guessed.any():
             longer = image_sizes if image_sizes.ndim == 1 else image_sizes.max(axis=1)
             by_cycles = vote_focal_by_rotation_cycles(
                 pairs, np.where(guessed, longer, focal), aspect, principal_points, guessed
             )
-            takes = guessed & by_cycles.reliable
-        elif focal_fits_cycles(pairs, focal, aspect, principal_points, asked):
-            takes = np.zeros(len(focal), dtype=bool)
+            replaced = guessed & by_cycles.reliable
+        elif focal_fits_cycles(pairs, focal, aspect, principal_points, undecided):
+            replaced = np.zeros(len(focal), dtype=bool)
         else:
-            by_cycles = vote_focal_by_rotation_cycles(pairs, focal, aspect, principal_points, asked)
-            takes = asked & (by_cycles.reliable and abs(np.log(by_cycles.factor)) > np.log1p(CYCLE_TOLERANCE))
+            by_cycles = vote_focal_by_rotation_cycles(pairs, focal, aspect, principal_points, undecided)
+            replaced = undecided & (by_cycles.reliable and abs(np.log(by_cycles.factor)) > np.log1p(CYCLE_TOLERANCE))
         if by_cycles is not None:
-            decided |= asked & by_cycles.reliable
-            focal = np.where(takes, by_cycles.focal_lengths, focal)
-        found |= takes
+            decided |= undecided & by_cycles.reliable
+            focal = np.where(replaced, by_cycles.focal_lengths, focal)
+        found |= replaced
     return SelfCalibration(focal, found, decided, votes, by_cycles)

@@ -1,1 +1,1 @@
-"""Poses from the epipolar error of all inliers, without a 3D point."""
+"""Structure-less bundle adjustment: poses that minimise the epipolar errors of all inlier matches."""

@@ -1,13 +1,14 @@
-"""Epipolar adjustment: all rotations, positions and free focal lengths by the epipolar errors of all matches.
+"""Epipolar adjustment: refinement of all rotations, positions and free focal lengths by the epipolar errors of matches.
 
 No point is triangulated. The Cauchy cost of the Sampson errors (see :mod:`colmap_vg.two_view.sampson`) of all edges is
-minimised over the cameras, ``R <- exp(w) R`` (w in the camera), ``p <- p + x``, by Levenberg's method on sparse blocks,
-together with that of the depths on which triplets of images must agree (see :mod:`colmap_vg.epipolar.depth_agreement`):
-each edge's normal equations by its five or seven parameters are carried to its cameras by the chain rule
+minimised over the cameras, ``R <- exp(w) R`` (w in the camera's frame), ``p <- p + x``, by Levenberg's method on sparse
+blocks, together with that of the differences of depths in image triplets (see
+:mod:`colmap_vg.epipolar.depth_agreement`). The normal equations of each edge by its five or seven parameters are mapped
+to its cameras by the chain rule
 
     w_ij = Q^T (R_ij^T w_j - w_i),   tau_ij = B^T (w_i x d) + B^T R_i (x_j - x_i) / |p_j - p_i|,   Q = [B, d].
 
-The robust scale shrinks in steps, down to the noise of the matches. A step is taken only where it lowers the true cost.
+The robust scale decreases in stages, down to the noise of the matches. Only steps that lower the true cost are taken.
 """
 
 from collections.abc import Sequence
@@ -32,18 +33,18 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_MAX_DAMPING = 1e6  # shares of the Hessian's diagonal
-_SHORTEST_BASELINE = 1e-6  # of the RMS distance of cameras; keeps the direction of coinciding cameras finite
-_COARSE = 300.0  # the next scale moves the cameras more than the last digits of this one
-_MAX_TURN = 0.2  # radians, in one step
-_MAX_LOG_FOCAL_STEP = 0.3
-_MAX_LOG_FOCAL = np.log(3.0)  # cameras with nearly no focal length see anything without an error
-_MIN_SIGMA_PX = 0.05  # pixels; no keypoints are better, and exact data keep a finite scale
+_MAX_DAMPING = 1e6  # share of the Hessian's diagonal
+_SHORTEST_BASELINE = 1e-6  # share of the RMS distance of cameras; keeps directions of coinciding cameras finite
+_EARLY_TOLERANCE = 300.0  # factor on the tolerance before the last stage, since the next scale changes the cameras more
+_MAX_TURN = 0.2  # radians per step
+_MAX_LOG_FOCAL_STEP = 0.3  # change of a log focal length per step
+_MAX_LOG_FOCAL = np.log(3.0)  # beyond it a focal length has diverged; errors vanish with the focal length
+_MIN_SIGMA_PX = 0.05  # pixels; below the noise of any keypoints, and keeps the scale of exact data finite
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustmentResult:
-    """Cameras after an epipolar adjustment.
+    """Cameras after an epipolar adjustment, with convergence information.
 
     Attributes
     ----------
@@ -51,17 +52,18 @@ class AdjustmentResult:
     projection_centers : (n, 3) array
         Centroid 0, root mean square distance 1.
     focal_scales : (c,) array
-        Factors on the focal lengths that the bearings were taken with; 1 for cameras that were not free.
+        Factors on the focal lengths that the bearings were computed with; 1 for cameras that were not free.
     lost_focals : (c,) bool array
-        Free focal lengths that the matches do not tell: they ran away, and were held as they came.
+        Free focal lengths that the matches do not determine: they diverged and are fixed at their initial value.
     reversed_edges : (m,) bool array
-        Edges whose given direction turned out to point away from the solved one; dropped on the way.
+        Edges whose given direction is more than a right angle from the solved one; dropped during the adjustment.
     cost : float
-        At the last scale, squared pixels.
+        Robust cost at the last scale, squared pixels.
     converged : bool
     scale_px : float
-        The last Cauchy scale.
+        The last Cauchy scale, pixels.
     log : tuple of LogEntry
+        One entry per iteration.
     """
 
     cam_from_world_rotations: Array
@@ -84,9 +86,9 @@ class Cameras:
     log_scales: Array
 
     def moved(self, step: Array, free: IntArray, reach: Array | None = None) -> "Cameras":
-        """After a step (6 n + f,): w and x of each image, then the free focals' logarithms; gauge put back.
+        """Cameras after a step (6 n + f,), w and x of each image, then the free log focals; with the gauge restored.
 
-        No image moves by more than its `reach` (n,), so that what the others gain does not pay for one that jumps.
+        The shift of each image is limited to its `reach` (n,), so that no camera jumps at the gain of the others.
         """
         n = len(self.centers)
         poses = step[: 6 * n].reshape(n, 6)
@@ -100,7 +102,7 @@ class Cameras:
         return Cameras(so3.exp(poses[:, :3]) @ self.rotations, gauged(self.centers + poses[:, 3:]), log_scales)
 
     def reach(self, edges: IntArray) -> Array:
-        """Half the way from each image to its nearest neighbour in the graph, (n,); no less than of a short edge."""
+        """Half the distance from each image to its nearest neighbour in the graph, with a lower limit: (n,)."""
         length = np.linalg.norm(self.centers[edges[:, 1]] - self.centers[edges[:, 0]], axis=1)
         nearest = np.full(len(self.centers), np.inf)
         np.minimum.at(nearest, edges.ravel(), np.repeat(length, 2))
@@ -117,7 +119,7 @@ class Cameras:
         return relative, directions, np.where(short, _SHORTEST_BASELINE, length)
 
     def about_middle(self, images: IntArray) -> TripletPoses:
-        """Poses of triplets (q, 3) seen from their middle images."""
+        """Poses of triplets (q, 3) relative to their middle images."""
         a, b, c = images.T
         R_b = self.rotations[b]
         baselines = np.stack([np.einsum("kab,kb->ka", R_b, self.centers[b] - self.centers[s]) for s in (a, c)])
@@ -140,26 +142,27 @@ def adjust_epipolar(
     max_num_iterations: int = 50,
     tolerance: float = 1e-5,
 ) -> AdjustmentResult:
-    """Minimise the epipolar errors of all matches from given cameras.
+    """Refine cameras by minimising the epipolar errors of all matches.
 
     Parameters
     ----------
     problem : EpipolarProblem
     initial_rotations : (n, 3, 3) array
-        cam_from_world.
+        cam_from_world rotations.
     initial_centers : (n, 3) array
+        Projection centres, world frame.
     directions : (m, 3) array
-        Camera 2's centre in camera 1's frame by the edge's own matches: the cost does not tell it from its opposite, so
-        after each scale edges that the cameras contradict by more than a right angle are dropped.
+        Camera 2's centre in camera 1's frame by the edge's own matches. The cost does not distinguish opposite
+        directions, so after each scale edges more than a right angle from the solved direction are dropped.
     initial_focal_scales : (c,) array, optional
-        Factors on the problem's focal lengths to start from, default 1.
+        Initial factors on the problem's focal lengths, default 1.
     scales_px : tuple of float
-        Cauchy scales in turn, pixels.
+        Successive Cauchy scales, pixels.
     final_sigmas : float
-        One more scale follows, this many robust standard deviations of the matches' own errors, where that is below the
-        last one: false matches that pass at a pixel bend what matches good to a quarter of it tell. 0: none follows.
+        Last Cauchy scale, in robust standard deviations of the matches' errors, if that is below the previous one:
+        false matches with errors of a pixel would bias a result that is accurate to a quarter of it. 0 omits it.
     max_num_iterations : int
-        Steps at each scale.
+        Maximum number of steps at each scale.
     tolerance : float
         Relative change of the cost at which the last scale ends; earlier ones end at three hundred times that.
 
@@ -170,7 +173,7 @@ def adjust_epipolar(
     Raises
     ------
     GraphError
-        There are no matches, or cameras at one place.
+        There are no matches, or all cameras coincide.
     """
     if len(problem.bearings1) == 0:
         raise GraphError("epipolar adjustment: the edges have no matches")
@@ -179,12 +182,12 @@ def adjust_epipolar(
         log_scales = np.zeros(len(lost)) if initial_focal_scales is None else np.log(initial_focal_scales)
         log_scales[lost] = 0.0
         start = Cameras(initial_rotations, gauged(initial_centers), log_scales)
-        held = replace(problem, free_focals=problem.free_focals & ~lost)
-        found = _in_stages(held, start, directions, scales_px, final_sigmas, max_num_iterations, tolerance)
-        ran_away = np.abs(np.log(found.focal_scales)) > _MAX_LOG_FOCAL
-        if not ran_away.any():
+        restricted = replace(problem, free_focals=problem.free_focals & ~lost)
+        found = _in_stages(restricted, start, directions, scales_px, final_sigmas, max_num_iterations, tolerance)
+        diverged = np.abs(np.log(found.focal_scales)) > _MAX_LOG_FOCAL
+        if not diverged.any():
             return replace(found, lost_focals=lost)
-        lost |= ran_away
+        lost |= diverged
 
 
 def _in_stages(
@@ -196,7 +199,7 @@ def _in_stages(
     max_num_iterations: int,
     tolerance: float,
 ) -> AdjustmentResult:
-    """One scale after the other; ends early where a focal length runs away."""
+    """Minimise at successive scales; end early if a focal length diverges."""
     reversed_edges, rows = np.zeros(len(problem.edges), dtype=bool), np.arange(len(problem.edges))
     log: list[LogEntry] = []
     scale, cost, converged = np.inf, np.inf, False
@@ -207,9 +210,9 @@ def _in_stages(
             scale = scales_px[stage]
         else:
             scale = min(scale, max(final_sigmas * _sigma(problem, cameras), _MIN_SIGMA_PX))
-        end = tolerance if last else _COARSE * tolerance
+        end = tolerance if last else _EARLY_TOLERANCE * tolerance
         cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log, near=stage > 0)
-        if _ran_away(cameras):
+        if _focal_diverged(cameras):
             break
         away = np.einsum("ka,ka->k", cameras.relative(problem.edges)[1], directions[rows]) < 0.0
         if away.any() and not away.all():
@@ -231,10 +234,10 @@ def _in_stages(
 
 
 def edge_errors(problem: EpipolarProblem, found: AdjustmentResult) -> Array:
-    """How far the matches of each edge are from adjusted cameras, pixels: (m,).
+    """Residual of each edge's matches at adjusted cameras, pixels: (m,).
 
-    The median Sampson error or, where it is larger, the median disagreement on depths in the best of the edge's
-    triplets: matches along their epipolar lines, as those of a façade that repeats itself, show in depth alone.
+    The median Sampson error or, if larger, the median depth residual in the best of the edge's triplets: false matches
+    along their epipolar lines, as on a façade with repeated structure, have large residuals in depth only.
     """
     cameras = Cameras(found.cam_from_world_rotations, found.projection_centers, np.log(found.focal_scales))
     R, d, _ = cameras.relative(problem.edges)
@@ -255,7 +258,7 @@ def _sigma(problem: EpipolarProblem, cameras: Cameras) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(residuals(problem.matches(cameras.log_scales), R, d))))
 
 
-def _ran_away(cameras: Cameras) -> bool:
+def _focal_diverged(cameras: Cameras) -> bool:
     return bool(np.any(np.abs(cameras.log_scales) > _MAX_LOG_FOCAL))
 
 
@@ -265,17 +268,17 @@ def gauged(centers: Array) -> Array:
     Raises
     ------
     GraphError
-        They are all the same.
+        All positions coincide.
     """
     centered = centers - centers.mean(axis=0)
     spread = np.sqrt(np.mean(np.sum(centered**2, axis=1)))
     if not spread > 0:
-        raise GraphError("epipolar adjustment: all cameras are at one place")
+        raise GraphError("epipolar adjustment: all cameras coincide")
     return np.asarray(centered / spread)
 
 
 def cost_and_gradient(problem: EpipolarProblem, cameras: Cameras, scale_px: float) -> tuple[float, Array]:
-    """Half the Cauchy cost, and its gradient (6 n + f,) as `Cameras.moved` takes steps."""
+    """Half the Cauchy cost, and its gradient (6 n + f,) in the parameters of `Cameras.moved`."""
     terms = _terms(problem, cameras, scale_px)
     return _total(terms) / 2.0, _system(problem).gradient(terms)
 
@@ -287,7 +290,7 @@ def _system(problem: EpipolarProblem) -> NormalSystem:
 
 
 def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float, *, near: bool = False) -> list[CameraTerms]:
-    """Robust costs of edges and of triplets with their derivatives by the cameras; Newton's curvature near the end."""
+    """Robust costs of edges and triplets with derivatives by the cameras; Newton Hessians of edges if `near`."""
     edges, with_focals = problem.edges, bool(problem.free_focals.any())
     R, d, length = cameras.relative(edges)
     at = normal_equations(
@@ -324,7 +327,7 @@ def edge_chain(R_i: Array, R: Array, d: Array, length: Array) -> Array:
     chain[:, :3, :3], chain[:, :3, 6:9] = -np.swapaxes(Q1, 1, 2), np.swapaxes(Q2, 1, 2)
     chain[:, 3, :3], chain[:, 4, :3] = B[:, 1], -B[:, 0]
     chain[:, 3:, 3:6], chain[:, 3:, 9:] = -along, along
-    # Where cameras coincide the direction means nothing: their distance must not be torn apart by it.
+    # The direction between coinciding cameras is undefined: it must not move them apart.
     chain[length <= _SHORTEST_BASELINE, 3:] = 0.0
     return chain
 
@@ -354,9 +357,10 @@ def _minimized(
     *,
     near: bool,
 ) -> tuple[Cameras, float, bool]:
-    """Cameras at the minimum for one scale, the cost, and whether the cost stood still.
+    """Minimise at one scale; return the cameras, the cost, and whether the cost converged.
 
-    Not `near` it, where many matches contradict the cameras, the steps of reweighted least squares are short and sure.
+    Far from the minimum (not `near`), where many matches have large errors, the steps are those of reweighted least
+    squares, which are shorter but safer.
     """
     system, damping = _system(problem), 1e-4
     terms = _terms(problem, cameras, scale, near=near)
@@ -367,7 +371,7 @@ def _minimized(
             step = system.step(terms, gradient, damping)
             if step is not None:
                 trial = cameras.moved(step, system.free, reach)
-                # A first step is nearly always taken: the derivatives that come next tell its cost by the way.
+                # A first step is nearly always accepted: compute the derivatives needed next, which include its cost.
                 ahead = _terms(problem, trial, scale, near=near) if attempt == 0 else None
                 cost = _total(ahead) if ahead is not None else _cost(problem, trial, scale)
                 if cost < before:
@@ -380,7 +384,7 @@ def _minimized(
         log.append(LogEntry("epipolar", iteration + 1, cost, change))
         if change < end:
             return cameras, cost, True
-        if _ran_away(cameras):
+        if _focal_diverged(cameras):
             break
         terms = ahead if ahead is not None else _terms(problem, cameras, scale, near=near)
     return cameras, before, False

@@ -1,13 +1,13 @@
-"""Lengths of baselines from the tracks that triplets of images share, and the positions that follow from them.
+"""Baseline lengths from tracks shared by image triplets, and positions from directions and lengths.
 
-A point that images a, b and c see has one depth in b. By image a it is the baseline's length over the inverse depth
-``rho_a`` that the rays give at unit length (see :mod:`colmap_vg.epipolar.depth_agreement`), so that
+A point seen in images a, b and c has one depth in b. From image a it is the baseline length over the inverse depth
+``rho_a`` that the rays give for a unit baseline (see :mod:`colmap_vg.epipolar.depth_agreement`), so that
 
-    log |p_b - p_a| - log |p_b - p_c| = log rho_a - log rho_c;
+    log |p_b - p_a| - log |p_b - p_c| = log rho_a - log rho_c.
 
-its median over the tracks ties the lengths of two edges. All logarithms at once are then a robust Laplacian problem on
-the graph whose nodes are edges, and positions a linear one: LS2 of Nasiri et al. with lambda known. Directions alone
-leave lengths along a line of cameras to the noise; here they are measured.
+The median over the tracks gives the ratio of two edge lengths. All log lengths then solve a robust Laplacian problem on
+the graph whose nodes are edges, and the positions a linear one: LS2 of Nasiri et al. with lambda known. Directions
+alone do not determine lengths along a line of cameras; here they are measured.
 """
 
 from dataclasses import dataclass
@@ -29,30 +29,33 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MIN_TRACKS = 10
-"""With depths in front of all three cameras; a link of fewer, or of fewer than half of its tracks, is none."""
+"""Minimum number of tracks of a ratio, and at least half of its tracks, with positive depths from both images."""
 MEDIAN_TO_MEAN = 1.2533
-"""Standard deviation of a median over that of a mean, normal noise."""
-LEAST_SIGMA = 0.02
-"""Added to a link's noise, squared: what its rotations and directions have wrong is the same for all its tracks."""
-MAX_FIRM_SIGMA = 0.1
-"""Of a logarithm: a ratio that noise may have wrong by more than a tenth holds no position."""
-NUM_L1_TURNS, NUM_CAUCHY_TURNS, LENGTH_TOLERANCE = 8, 22, 1e-4
+"""Standard deviation of a median over that of a mean, for normal noise."""
+MIN_SIGMA = 0.02
+"""Noise of a log ratio from errors of rotations and directions, common to all its tracks; added in quadrature."""
+MAX_RELIABLE_SIGMA = 0.1
+"""Largest standard deviation of a log ratio that may fix positions."""
+NUM_L1_ITERATIONS, NUM_CAUCHY_ITERATIONS, LENGTH_TOLERANCE = 8, 22, 1e-4
+"""Reweighting iterations with L1 and Cauchy weights, and change of log lengths at which they end."""
 RESIDUAL_SCALES = (2.0, 0.5, 0.2, 0.1)
-"""Geman-McClure scales of positions' residuals in turn, shares of the edge's length."""
-TURNS_PER_SCALE = 3
+"""Successive Geman-McClure scales of the residuals of positions, as shares of the edge length."""
+ITERATIONS_PER_SCALE = 3
+"""Reweighting iterations at each of these scales."""
 
 
 @dataclass(frozen=True, eq=False)
-class LengthLinks:
-    """Differences of logarithms of edges' lengths.
+class BaselineRatios:
+    """Measured ratios of the lengths of two edges.
 
     Attributes
     ----------
     edges : (q, 2) int64 array
+        Rows of the two edges.
     log_ratios : (q,) array
         Logarithm of the first edge's length over the second's.
     sigmas : (q,) array
-        Standard deviations of these by the scatter of their tracks.
+        Standard deviations of the log ratios, from the scatter of their tracks.
     """
 
     edges: IntArray
@@ -60,30 +63,30 @@ class LengthLinks:
     sigmas: Array
 
     @property
-    def firm(self) -> BoolArray:
-        """Links whose noise lets them hold positions, (q,)."""
-        return np.asarray(np.hypot(self.sigmas, LEAST_SIGMA) <= MAX_FIRM_SIGMA)
+    def reliable(self) -> BoolArray:
+        """Mask (q,) of the ratios that are accurate enough to fix positions."""
+        return np.asarray(np.hypot(self.sigmas, MIN_SIGMA) <= MAX_RELIABLE_SIGMA)
 
 
-def length_links(problem: EpipolarProblem, relative_rotations: Array, directions: Array) -> LengthLinks:
-    """Ratios of the lengths of edges that meet in an image, by the depths of the tracks that they share.
+def estimate_baseline_ratios(problem: EpipolarProblem, relative_rotations: Array, directions: Array) -> BaselineRatios:
+    """Estimate ratios of the lengths of edges that share an image, from the depths of their shared tracks.
 
     Parameters
     ----------
     problem : EpipolarProblem
     relative_rotations : (m, 3, 3) array
-        cam2_from_cam1 of its edges.
+        cam2_from_cam1 rotations of its edges.
     directions : (m, 3) array
-        Camera 2's centre in camera 1's frame, unit.
+        Unit directions of camera 2's centre in camera 1's frame.
 
     Returns
     -------
-    LengthLinks
-        None for edges without triplets.
+    BaselineRatios
+        Edges without triplets have none.
     """
     triplets = problem.triplets
     if triplets is None:
-        return LengthLinks(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
+        return BaselineRatios(np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))
     rotations, baselines = [], []
     for side, other in ((0, 0), (1, 2)):
         rows = triplets.edges[:, side]
@@ -99,40 +102,40 @@ def length_links(problem: EpipolarProblem, relative_rotations: Array, directions
     median = segment_quantiles(offsets, ratios)
     scatter = MAD_TO_SIGMA * segment_quantiles(offsets, np.abs(ratios - np.repeat(median, count)))
     good = (count >= MIN_TRACKS) & (count >= 0.5 * np.diff(triplets.offsets))
-    return LengthLinks(
+    return BaselineRatios(
         triplets.edges[good], median[good], MEDIAN_TO_MEAN * scatter[good] / np.sqrt(np.maximum(count[good], 1))
     )
 
 
-def solve_lengths(num_edges: int, links: LengthLinks) -> Array:
-    """Lengths of the edges that links join into the largest group, up to a common factor.
+def solve_lengths(num_edges: int, ratios: BaselineRatios) -> Array:
+    """Solve for the lengths of the largest set of edges that ratios connect, up to a common factor.
 
     Parameters
     ----------
     num_edges : int
         m.
-    links : LengthLinks
+    ratios : BaselineRatios
 
     Returns
     -------
     (m,) array
-        NaN for the other edges. Geometric mean 1.
+        Geometric mean 1; NaN for the other edges.
     """
     lengths = np.full(num_edges, np.nan)
-    if len(links.edges) == 0:
+    if len(ratios.edges) == 0:
         return lengths
-    first, second = links.edges.T
-    largest = components_by_size(num_edges, links.edges) == 0
+    first, second = ratios.edges.T
+    largest = components_by_size(num_edges, ratios.edges) == 0
     used, number = largest[first], np.cumsum(largest) - 1
-    first, second, ratios = number[first[used]], number[second[used]], links.log_ratios[used]
-    weights = 1.0 / (links.sigmas[used] ** 2 + LEAST_SIGMA**2)
+    first, second, log_ratios = number[first[used]], number[second[used]], ratios.log_ratios[used]
+    weights = 1.0 / (ratios.sigmas[used] ** 2 + MIN_SIGMA**2)
     laplacian = ReweightedLaplacian(int(largest.sum()), np.stack([second, first], axis=1))
     x, reweighted = np.zeros(int(largest.sum())), weights
-    for turn in range(NUM_L1_TURNS + NUM_CAUCHY_TURNS):
-        new = laplacian.solve(reweighted, laplacian.divergence((reweighted * ratios)[None]))[:, 0]
+    for iteration in range(NUM_L1_ITERATIONS + NUM_CAUCHY_ITERATIONS):
+        new = laplacian.solve(reweighted, laplacian.divergence((reweighted * log_ratios)[None]))[:, 0]
         change, x = float(np.abs(new - x).max()), new
-        whitened = np.abs(x[first] - x[second] - ratios) * np.sqrt(weights)
-        if turn < NUM_L1_TURNS:
+        whitened = np.abs(x[first] - x[second] - log_ratios) * np.sqrt(weights)
+        if iteration < NUM_L1_ITERATIONS:
             reweighted = weights / np.maximum(whitened, 1.0)
             continue
         if change < LENGTH_TOLERANCE:
@@ -144,14 +147,14 @@ def solve_lengths(num_edges: int, links: LengthLinks) -> Array:
 
 
 def connects_all(num_images: int, edges: IntArray, known: BoolArray) -> bool:
-    """Whether the known ones of the edges (m, 2) join all images."""
+    """Whether those edges (m, 2) that the mask `known` (m,) marks connect all images."""
     return bool((components_by_size(num_images, edges[known]) == 0).all())
 
 
 def positions_by_lengths(
     num_images: int, edges: IntArray, directions_world: Array, lengths: Array, start: Array | None = None
 ) -> Array:
-    """Positions whose differences come near ``lambda gamma``, robustly, for lengths known on all or some edges.
+    """Solve robustly for positions whose differences are close to ``lambda gamma``, with lengths of all or some edges.
 
     Parameters
     ----------
@@ -162,10 +165,10 @@ def positions_by_lengths(
     directions_world : (m, 3) array
         Unit ``gamma_ij``, world frame.
     lengths : (m,) array
-        NaN where not known.
+        NaN where unknown.
     start : (n, 3) array, optional
-        Positions at any scale, from which edges of unknown length take theirs, anew in each turn. Without it these
-        edges are left out, and those of known lengths must join all images.
+        Initial positions of any scale. Edges of unknown length take their length from the current positions in each
+        iteration. Without them these edges are ignored, and the others must connect all images.
 
     Returns
     -------
@@ -182,7 +185,7 @@ def positions_by_lengths(
         scale = float(np.median(lengths[known] / own[known])) if known.any() else 1.0
         p = scale * start
     system, weights = LaplacianSystem(num_images, edges), np.ones(len(edges))
-    for sigma in np.repeat(RESIDUAL_SCALES, TURNS_PER_SCALE):
+    for sigma in np.repeat(RESIDUAL_SCALES, ITERATIONS_PER_SCALE):
         if p is not None:
             lengths = np.where(known, lengths, edge_lengths(p, edges, spread(p)))
         factor = system.factor(weights / lengths**2)

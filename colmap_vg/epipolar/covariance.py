@@ -1,14 +1,14 @@
-"""How well the adjusted cameras are known: their covariance under the noise of the keypoints.
+"""Covariances of adjusted cameras under the noise of the keypoints, by Monte Carlo propagation.
 
-One noisy keypoint enters every pair and triplet that matched it, so that residuals which share it are correlated; to
-take them for independent makes a camera seen in many pairs look far too certain. Here draws of keypoint noise go
-through all residuals that they touch, and through the normal equations at the minimum, to the cameras: no inverse, no
-pairs of residuals.
+The noise of a keypoint affects every pair and triplet that matches it, so that residuals sharing it are correlated;
+under the assumption of independence, a camera in many pairs would seem far too certain. Here samples of keypoint noise
+are propagated through all residuals that they affect and through the normal equations at the minimum to the cameras,
+which needs neither an inverse nor covariances of residuals.
 
-To first order, the minimum of ``sum rho(r)`` moves by ``-(E psi' sum J J^T)^-1 sum psi(r) J``. Of ``psi(r) / E psi'``
-the part linear in the noise is r itself, shared by all residuals of a keypoint; the rest, of variance
-``E psi^2 / (E psi')^2 - sigma^2``, is taken as each residual's own (of odd functions of two normal numbers with
-correlation c, all but the linear part have covariances of order c^3).
+To first order, the minimum of ``sum rho(r)`` moves by ``-(E psi' sum J J^T)^-1 sum psi(r) J``. The part of
+``psi(r) / E psi'`` that is linear in the noise is r itself, shared by all residuals of a keypoint. The remainder, of
+variance ``E psi^2 / (E psi')^2 - sigma^2``, is treated as independent between residuals (for odd functions of two
+normal variables with correlation c, all but the linear part have covariances of order c^3).
 """
 
 from dataclasses import dataclass, replace
@@ -31,23 +31,24 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 NUM_DRAWS = 128
-"""Of noise: variances come out within an eighth of their value."""
+"""Number of noise samples, from which variances are estimated to within an eighth."""
 DRAWS_AT_ONCE = 32
-_UNWEIGHTED = 1e9  # pixels; a loss of this scale weighs all residuals alike
+"""Number of noise samples that are propagated together."""
+_UNWEIGHTED = 1e9  # pixels; a loss of this scale gives all residuals the same weight
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCovariances:
-    """Covariances after the similarity that best aligns all positions has been taken out.
+    """Covariances of poses after the similarity that best aligns all positions is removed.
 
     Attributes
     ----------
     positions : (n, 3, 3) array
-        Of the centres, in the cameras' world frame and unit.
+        Covariances of the centres, in the world frame and squared unit of the cameras.
     rotations : (n, 3, 3) array
-        Of small turns w of each camera in its own frame, ``R <- exp(w) R``, squared radians.
+        Covariances of small rotations w of each camera in its own frame, ``R <- exp(w) R``, squared radians.
     sigma_px : float
-        Standard deviation of a keypoint in each axis, pixels.
+        Standard deviation of a keypoint per axis, pixels.
     """
 
     positions: Array
@@ -58,16 +59,18 @@ class CameraCovariances:
 def camera_covariances(
     problem: EpipolarProblem, found: AdjustmentResult, *, seed: int = 0, num_draws: int = NUM_DRAWS
 ) -> CameraCovariances:
-    """Covariances of adjusted cameras.
+    """Estimate the covariances of adjusted cameras.
 
     Parameters
     ----------
     problem : EpipolarProblem
-        As it was adjusted. Without keypoints of the matches, these are taken for independent.
+        The adjusted problem. Without keypoint indices, matches are treated as independent.
     found : AdjustmentResult
+        Result of the adjustment.
     seed : int
-        Of the draws.
+        Random seed of the noise samples.
     num_draws : int
+        Number of noise samples.
 
     Returns
     -------
@@ -100,10 +103,10 @@ def camera_covariances(
 
 @dataclass(frozen=True, eq=False)
 class _Residuals:
-    """Residuals of one kind with s rays each, in segments that the same cameras see.
+    """Residuals of pairs (s = 2 rays each) or triplets (s = 3), in segments with the same cameras.
 
     Residuals (k,) in pixels; derivatives (k, b) by the segment's parameters and log focals, and (s, k, 3) by the
-    noise of its keypoints; keypoints (s, k) counted through; derivatives (q, b', 6 s) of the parameters by the cameras.
+    noise of its keypoints; keypoint numbers (s, k); derivatives (q, b', 6 s) of the parameters by the cameras.
     """
 
     r: Array
@@ -115,14 +118,14 @@ class _Residuals:
     terms: CameraTerms
 
     def moved(self, noise: Array) -> Array:
-        """Changes of the residuals (k, draws) under noise (keypoints, 3 draws) of the keypoints."""
+        """Changes (k, draws) of the residuals caused by noise (keypoints, 3 draws) of the keypoints."""
         total = np.zeros((len(self.r), noise.shape[1] // 3))
         for keypoints, along in zip(self.keypoints, self.by_noise, strict=True):
             total += np.einsum("ka,kad->kd", along, noise[keypoints].reshape(len(keypoints), 3, -1))
         return total
 
     def pull(self, dr: Array) -> tuple[Array, Array]:
-        """Gradients by poses (q, 6 s, draws) and log focals (q, s, draws) that changes (k, draws) of residuals make."""
+        """Gradients by poses (q, 6 s, draws) and log focals (q, s, draws) for changes (k, draws) of the residuals."""
         rows = np.arange(len(self.r))
         q, b, wide = self.chain.shape
         by_parameter = np.stack(
@@ -137,7 +140,7 @@ class _Residuals:
 
 
 def _residuals(problem: EpipolarProblem, cameras: Cameras) -> list[_Residuals]:
-    """Residuals of pairs and, where there are any, of triplets."""
+    """Residuals of the pairs and, if there are any, of the triplets."""
     with_focals, numbers = bool(problem.free_focals.any()), _numbered_keypoints(problem)
     edges, (R, d, length) = problem.edges, cameras.relative(problem.edges)
     matches = problem.matches(cameras.log_scales)
@@ -176,7 +179,7 @@ def _residuals(problem: EpipolarProblem, cameras: Cameras) -> list[_Residuals]:
 
 
 def _numbered_keypoints(problem: EpipolarProblem) -> list[IntArray]:
-    """Numbers from 0 of the keypoints in all images together: of pairs (2, k), and of triplets (3, k)."""
+    """Consecutive numbers of the keypoints of all images: for pairs (2, k), and for triplets (3, k)."""
     if problem.keypoints1 is None or problem.keypoints2 is None:
         return [np.arange(2 * len(problem.bearings1)).reshape(2, -1)]
     pairs = np.stack([problem.keypoints1, problem.keypoints2]).astype(np.int64)
@@ -193,7 +196,7 @@ def _numbered_keypoints(problem: EpipolarProblem) -> list[IntArray]:
 
 
 def _noise(kinds: list[_Residuals], scale_px: float, num_parameters: int) -> tuple[float, float]:
-    """Deviations in pixels: of a keypoint in each axis, and of what the loss adds to each residual by itself."""
+    """Standard deviations in pixels: of a keypoint per axis, and of the independent part that the loss adds."""
     r = np.concatenate([kind.r for kind in kinds])
     numbers = np.concatenate([kind.keypoints.ravel() for kind in kinds])
     count, links = (
@@ -202,7 +205,7 @@ def _noise(kinds: list[_Residuals], scale_px: float, num_parameters: int) -> tup
     )
     joined = np.concatenate(links, axis=1)
     num_points = int(components_by_size(count, joined.T).max()) + 1
-    # Two numbers a keypoint, of which a point takes three and the cameras theirs.
+    # Two coordinates per keypoint, minus three per point; the cameras' parameters are subtracted below.
     num_constraints = 2 * count - 3 * num_points
     freedom = num_constraints / max(num_constraints - num_parameters, 1)
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(r))) * np.sqrt(freedom)
@@ -212,11 +215,11 @@ def _noise(kinds: list[_Residuals], scale_px: float, num_parameters: int) -> tup
 
 
 def _without_gauge(cameras: Cameras, step: Array) -> tuple[Array, Array]:
-    """Turns and shifts (n, 3, draws) after the best small similarity of the shifts has been taken out."""
+    """Rotations and shifts (n, 3, draws) of a step after the best small similarity of the shifts is removed."""
     turns, shifts = step[:, :3], step[:, 3:]
     p = cameras.centers - cameras.centers.mean(axis=0)
     shifts = shifts - shifts.mean(axis=0)
-    # Small similarity: x -> omega x p + s p; a world turned by omega turns cameras by -R omega.
+    # Small similarity: x -> omega x p + s p; rotating the world by omega rotates cameras by -R omega.
     basis = np.concatenate([-so3.hat(p), p[:, :, None]], axis=2).reshape(-1, 4)
     n, _, draws = shifts.shape
     similarity = np.linalg.lstsq(basis, shifts.reshape(-1, draws), rcond=None)[0]

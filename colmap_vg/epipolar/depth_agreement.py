@@ -1,17 +1,18 @@
-"""Scale along lines of cameras: a point that three cameras see has one depth in the middle one.
+"""Depth residuals of image triplets, which determine ratios of baselines along lines of cameras.
 
-Epipolar errors do not feel the ratio of two baselines along a line. With the rays ``u`` of a track in images a, b, c,
-all in the frame of b, and ``t = p_b - p_a``, the inverse depth in b along ``u_b`` by image a is
+Epipolar errors do not depend on the ratio of two baselines along a line. But a point that three cameras see has one
+depth in the middle one. With the rays ``u`` of a track in images a, b, c, all in the frame of b, and ``t = p_b - p_a``,
+the inverse depth in b along ``u_b`` from image a is
 
     rho_a = A . P / P . P,    A = u_b x u_a,    P = u_a x t,
 
-and likewise by c. The residual is ``r = h / s``, ``h = rho_a - rho_c``, with the variance ``s^2`` of h under a pixel of
-noise in each of the three rays: it is in pixels, and close to normal for far points too, as disparities are. No point
-is made. Derivatives include those of s: with ``G = dh/du`` and ``g = v (G - (G . u) u)``, half the derivative of
-``s^2 = sum g . G`` is the derivative of G along g.
+and likewise from c. The residual is ``r = h / s``, ``h = rho_a - rho_c``, with the variance ``s^2`` of h under a pixel
+of noise in each of the three rays. It is in pixels and, like a disparity, close to normal for distant points, too. No
+point is triangulated. Derivatives include those of s: with ``G = dh/du`` and ``g = v (G - (G . u) u)``, half the
+derivative of ``s^2 = sum g . G`` is the derivative of G along g.
 
-A triplet is moved by turns of the rays of a and c in the frame of b (3 + 3), by t of a and of c (3 + 3), and by the
-logarithms of the three focal lengths.
+The parameters of a triplet are rotations of the rays of a and c in the frame of b (3 + 3), t of a and of c (3 + 3), and
+the logarithms of the three focal lengths.
 """
 
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.two_view.pieces import Block, Pieces, shrunk
+from colmap_vg.two_view.pieces import Block, Pieces, rescaled_rays
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -36,23 +37,23 @@ class TripletRays:
         Unit rays in a, b and c, each in its own camera: nine columns.
     variances : (3, q) array
         ``1 / f^2``, squared radians per squared pixel.
-    shrinks : (3, q) array or None
-        Factors on the first two coordinates of the rays, which are then normalised: those of a longer focal length.
+    focal_ratios : (3, q) array or None
+        Old over new focal length: the first two coordinates of the rays are multiplied by it, and the rays normalised.
     """
 
     pieces: Pieces
     variances: Array
-    shrinks: Array | None = None
+    focal_ratios: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class TripletPoses:
-    """Relative poses of a and of c seen from b.
+    """Poses of a and of c relative to b.
 
     Attributes
     ----------
     rotations : (2, q, 3, 3) array
-        From a to b, and from c to b.
+        Rotations from a to b, and from c to b.
     baselines : (2, q, 3) array
         ``p_b - p_a`` and ``p_b - p_c`` in b's frame.
     """
@@ -71,13 +72,13 @@ class TripletEquations:
 
 
 def depth_residuals(rays: TripletRays, poses: TripletPoses) -> Array:
-    """Residuals of all tracks in pixels: (k,)."""
+    """Depth residuals of all tracks in pixels: (k,)."""
     parts = [rays.pieces.rows(_evaluate(rays, poses, block).r, block) for block in rays.pieces.blocks()]
     return np.concatenate([np.zeros(0), *parts])
 
 
 def inverse_depths(rays: TripletRays, poses: TripletPoses) -> Array:
-    """Inverse depths of all tracks in b, by a and by c: (2, k)."""
+    """Inverse depths of all tracks in b, from image a and from image c: (2, k)."""
     pieces = rays.pieces
     parts = [
         pieces.rows(np.stack([side.rho for side in _evaluate(rays, poses, block).sides]), block)
@@ -87,7 +88,7 @@ def inverse_depths(rays: TripletRays, poses: TripletPoses) -> Array:
 
 
 def depth_costs(rays: TripletRays, poses: TripletPoses, scale: float) -> Array:
-    """``sum s^2 log(1 + r^2 / s^2)`` of each triplet, with the scale s in pixels: (q,)."""
+    """Cauchy costs ``sum s^2 log(1 + r^2 / s^2)`` of each triplet, with the scale s in pixels: (q,)."""
     costs = np.zeros(rays.pieces.num_segments)
     for block in rays.pieces.blocks():
         ratio = np.square(_evaluate(rays, poses, block).r / scale)
@@ -98,7 +99,7 @@ def depth_costs(rays: TripletRays, poses: TripletPoses, scale: float) -> Array:
 def depth_equations(
     rays: TripletRays, poses: TripletPoses, scale: float, *, with_focals: bool = False
 ) -> TripletEquations:
-    """Cauchy costs and their normal equations by (turn a, turn c, t of a, t of c), and the log focals where asked."""
+    """Cauchy costs and normal equations by (rotation of a, of c, t of a, of c) and, `with_focals`, the log focals."""
     q, b = rays.pieces.num_segments, 15 if with_focals else 12
     costs, products = np.zeros(q), np.zeros((q, b, b + 1))
     for block in rays.pieces.blocks():
@@ -109,7 +110,7 @@ def depth_equations(
         costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
         products[block.segments] = block.totals(weighted @ np.swapaxes(columns, 1, 2))
     hessians = products[:, :, :b]
-    # Both triangles were summed; their last digits differ.
+    # Both triangles were summed separately and differ in the last digits.
     hessians = 0.5 * (hessians + np.swapaxes(hessians, 1, 2))
     return TripletEquations(scale**2 * costs, products[:, :, b], hessians)
 
@@ -118,8 +119,8 @@ def depth_equations(
 class DepthDerivatives:
     """Residuals (k,) in pixels, with derivatives by the poses and log focals (b, k) and by the keypoints.
 
-    `by_rays` (3, 3, k): of images a, b, c, tangent to the rays in the frames of their cameras, per pixel of the
-    keypoint's noise (its pull on s left out); the squared norms sum to one.
+    `by_rays` (3, 3, k) are derivatives by the rays in images a, b, c, tangent to them in the frames of their cameras,
+    per pixel of keypoint noise (its effect on s is neglected); the squared norms sum to one.
     """
 
     r: Array
@@ -130,13 +131,13 @@ class DepthDerivatives:
 def depth_derivatives_by_block(
     rays: TripletRays, poses: TripletPoses, *, with_focals: bool = False
 ) -> Iterator[tuple[slice, slice, IntArray, DepthDerivatives]]:
-    """Runs of whole triplets: their slice, their rows' slice, offsets from the first row, and derivatives."""
+    """Iterate over runs of whole triplets: their slice, the slice of their rows, relative offsets, and derivatives."""
     pieces = rays.pieces
     for block in pieces.blocks():
         at = _evaluate(rays, poses, block)
         by_rays = np.stack(at.along) / np.sqrt(at.variances * at.variance)[:, None]
         for image in (0, 2):
-            by_rays[image] = _turned(np.swapaxes(at.turns[image // 2], 1, 2), np.moveaxis(by_rays[image], 0, 1))
+            by_rays[image] = _rotated(np.swapaxes(at.turns[image // 2], 1, 2), np.moveaxis(by_rays[image], 0, 1))
         by_pose = np.moveaxis(_jacobian_and_residuals(at, with_focals)[:, :-1], 1, 0)
         offsets = pieces.offsets[block.segments.start : block.segments.stop + 1]
         yield (
@@ -149,7 +150,7 @@ def depth_derivatives_by_block(
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """Inverse depth in b by one other image, and its derivatives by the rays and the baseline: (3, pieces, length)."""
+    """Inverse depth in b from one other image, with derivatives by rays and baseline: (3, pieces, length)."""
 
     u: Array
     t: Array
@@ -166,9 +167,10 @@ class _Side:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """A block of tracks: dh/du of each image (`by_ray`), g (`along`), g . G (`noise`), s^2, r, and their sources.
+    """Residuals r of a block of tracks with dh/du of each image (`by_ray`), g (`along`), g . G (`noise`) and s^2.
 
-    Vectors are (3, pieces, length); own rays (3, pieces, 3, length), turns (2, pieces, 3, 3), variances (3, pieces, 1).
+    Vectors are (3, pieces, length); own rays (3, pieces, 3, length), rotations `turns` (2, pieces, 3, 3), variances
+    (3, pieces, 1).
     """
 
     own: Array
@@ -187,11 +189,11 @@ def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
     triplet = rays.pieces.segments[block.pieces]
     columns = rays.pieces.columns[block.pieces]
     own = np.stack([columns[:, 3 * s : 3 * s + 3] for s in range(3)])
-    if rays.shrinks is not None:
-        own = np.stack([shrunk(x, factor[triplet]) for x, factor in zip(own, rays.shrinks, strict=True)])
+    if rays.focal_ratios is not None:
+        own = np.stack([rescaled_rays(x, ratios[triplet]) for x, ratios in zip(own, rays.focal_ratios, strict=True)])
     turns, baselines = poses.rotations[:, triplet], poses.baselines[:, triplet]
     middle = np.moveaxis(own[1], 1, 0)
-    a, c = (_side(_turned(turns[s], own[2 * s]), middle, baselines[s].T[:, :, None]) for s in (0, 1))
+    a, c = (_side(_rotated(turns[s], own[2 * s]), middle, baselines[s].T[:, :, None]) for s in (0, 1))
     variances = rays.variances[:, triplet, None]
     by_ray = [a.by_own, a.by_middle - c.by_middle, -c.by_own]
     along, noise = [], []
@@ -204,14 +206,14 @@ def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
     return _Tracks(own, turns, middle, variances, (a, c), by_ray, along, noise, variance, r)
 
 
-def _turned(turns: Array, x: Array) -> Array:
-    """Turned vectors (pieces, 3, length), components first."""
+def _rotated(turns: Array, x: Array) -> Array:
+    """Rotated vectors (pieces, 3, length), with the components as first axis."""
     return np.moveaxis(turns @ x, 1, 0)
 
 
 def _side(u: Array, middle: Array, t: Array) -> _Side:
     A, P = _cross(middle, u), _cross(u, t)
-    # A point on the line of the two cameras has no depth by them: P = 0 and, with the floor, infinite variance.
+    # The depth of a point on the line through both cameras is undetermined: P = 0 and, with the floor, huge variance.
     square = np.maximum(_dot(P, P), 1e-24 * _dot(t, t) + np.finfo(float).tiny)
     alpha = P / square
     rho = _dot(A, alpha)
@@ -232,7 +234,7 @@ def _side(u: Array, middle: Array, t: Array) -> _Side:
 
 
 def _derivative(side: _Side, middle: Array, du: Array, dmiddle: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of a side's `by_middle`, `by_own` and `by_baseline` as its rays move along du and dmiddle."""
+    """Directional derivatives of a side's `by_middle`, `by_own` and `by_baseline` along changes du, dmiddle of rays."""
     dA = _cross(dmiddle, side.u) + _cross(middle, du)
     dP = _cross(du, side.t)
     dsquare = 2.0 * _dot(side.P, dP)
@@ -245,13 +247,13 @@ def _derivative(side: _Side, middle: Array, du: Array, dmiddle: Array) -> tuple[
 
 
 def _jacobian_and_residuals(at: _Tracks, with_focals: bool) -> Array:
-    """Derivatives of the residuals, 12 or with the focal lengths 15, and the residuals: (pieces, 13 or 16, length)."""
+    """Derivatives of the residuals (12, or 15 with focal lengths), then the residuals: (pieces, 13 or 16, length)."""
     (a, c), rays = at.sides, (at.sides[0].u, at.middle, at.sides[1].u)
     bend_a = _derivative(a, at.middle, at.along[0], at.along[1])
     bend_c = _derivative(c, at.middle, at.along[2], at.along[1])
     inverse, ratio = 1.0 / np.sqrt(at.variance), at.r / at.variance
     bends = (bend_a[1], bend_a[0] - bend_c[0], -bend_c[1])
-    # d(h/s) = dh/s - (r/s^2) d(s^2)/2; the ray itself moves in (G . u)^2 too.
+    # d(h/s) = dh/s - (r/s^2) d(s^2)/2; (G . u)^2 depends on the ray itself, too.
     by_ray = [
         G * inverse - ratio * (bend - _dot(G, u) * along)
         for G, bend, u, along in zip(at.by_ray, bends, rays, at.along, strict=True)
@@ -267,7 +269,7 @@ def _jacobian_and_residuals(at: _Tracks, with_focals: bool) -> Array:
         for k, x in enumerate(at.own):
             depth = x[:, 2:]
             pull = depth * (axis - depth * x)
-            pull = np.moveaxis(pull, 1, 0) if k == 1 else _turned(at.turns[k // 2], pull)
+            pull = np.moveaxis(pull, 1, 0) if k == 1 else _rotated(at.turns[k // 2], pull)
             J[12 + k] = _dot(by_ray[k], pull) + ratio * at.noise[k]
     J[-1] = at.r
     return whole

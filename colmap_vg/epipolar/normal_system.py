@@ -1,4 +1,4 @@
-"""Sparse normal equations of cameras and shared focal lengths, from terms that each see two or three cameras."""
+"""Sparse normal equations of camera poses and shared focal lengths, from cost terms of two or three cameras each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,24 +14,27 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MIN_DAMPING = 1e-9
-"""Share of the Hessian's diagonal that is always added: the gauge leaves seven directions free."""
+"""Share of the Hessian's diagonal that is always added, since the gauge leaves seven degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraTerms:
-    """Terms of a cost that see s cameras each, and their derivatives.
+    """Cost terms of s cameras each, with their derivatives.
 
     Attributes
     ----------
     images : (q, s) int64 array
     costs : (q,) array
     pose_gradients : (q, 6 s) array
-        By turn and shift of each image.
+        Derivatives by rotation and position of each image.
     focal_gradients : (q, s) array
-        By the logarithms of the focal lengths of the images' cameras; zero where they are held.
+        Derivatives by the log focal lengths of the images' cameras; zero if none is free.
     pose_blocks : (q, 6 s, 6 s) array
+        Hessians by poses.
     cross_blocks : (q, 6 s, s) array
+        Hessians by poses and log focal lengths.
     focal_blocks : (q, s, s) array
+        Hessians by log focal lengths.
     """
 
     images: IntArray
@@ -44,7 +47,7 @@ class CameraTerms:
 
     @classmethod
     def chained(cls, images: IntArray, costs: Array, gradients: Array, hessians: Array, chain: Array) -> "CameraTerms":
-        """From derivatives (q, b + s) by b parameters and s log focals, and those of the parameters (q, b, 6 s)."""
+        """Apply the chain rule: derivatives (q, b + s) by b parameters and s log focals, chain (q, b, 6 s) to poses."""
         q, b, _ = chain.shape
         s = images.shape[1]
         turned = np.swapaxes(chain, 1, 2)
@@ -61,14 +64,15 @@ class CameraTerms:
 
 
 class NormalSystem:
-    """Gradients and Levenberg steps on the pattern of given terms, sorted once.
+    """Gradients and Levenberg steps for terms of a fixed sparsity pattern, which is analysed once.
 
     Parameters
     ----------
     num_images : int
     images : sequence of (q, s) int64 arrays
-        One for each kind of terms.
+        Images of the terms, one array for each kind.
     camera_idx : (n,) int64 array
+        Camera of each image.
     free : (f,) int64 array
         Cameras whose focal lengths are unknowns.
     num_cameras : int
@@ -88,7 +92,7 @@ class NormalSystem:
         return self.summed([t.pose_gradients for t in terms], [t.focal_gradients for t in terms])
 
     def summed(self, by_poses: Sequence[Array], by_focals: Sequence[Array]) -> Array:
-        """Sum of one or more columns by poses (q, 6 s, ...) and by log focals (q, s, ...) of terms: (6 n + f, ...)."""
+        """Sum columns by poses (q, 6 s, ...) and by log focals (q, s, ...) over all terms: (6 n + f, ...)."""
         columns = by_poses[0].shape[2:]
         poses = np.zeros((self.num_images, 6, *columns))
         focals = np.zeros((len(self.free), *columns))
@@ -100,17 +104,17 @@ class NormalSystem:
         return np.concatenate([poses.reshape(-1, *columns), focals])
 
     def factor(self, terms: Sequence[CameraTerms]) -> Factor:
-        """The factored Hessian, without damping but what the gauge needs.
+        """Factor the Hessian, damped only as much as the gauge requires.
 
         Raises
         ------
         SingularMatrixError
-            The terms do not fix all cameras.
+            The terms do not determine all cameras.
         """
         return factorize(self._matrix(terms, 0.0))
 
     def step(self, terms: Sequence[CameraTerms], gradient: Array, damping: float) -> Array | None:
-        """Levenberg's step (6 n + f,), each diagonal entry raised by its share; None where that does not suffice."""
+        """Levenberg step (6 n + f,) with damping relative to the diagonal; None if the matrix is still singular."""
         try:
             return -factorize(self._matrix(terms, damping)).solve(gradient)
         except SingularMatrixError:
@@ -141,14 +145,14 @@ class NormalSystem:
 
 
 def _pairs(images: IntArray) -> IntArray:
-    """Pairs of cameras in the order of `_split`."""
+    """Pairs of cameras of the terms, in the order of `_split`."""
     if images.shape[1] == 2:
         return images
     return np.concatenate([images[:, [s, (s + 1) % 3]] for s in range(3)])
 
 
 def _split(blocks: Array) -> tuple[Array, Array, Array]:
-    """Blocks of pairs, with each camera's own in one of its pairs: ii, jj, ij."""
+    """Blocks ii, jj and ij of pairs; the diagonal block of each camera is assigned to one of its pairs."""
     if blocks.shape[1] == 12:
         return blocks[:, :6, :6], blocks[:, 6:, 6:], blocks[:, :6, 6:]
     parts = [slice(0, 6), slice(6, 12), slice(12, 18)]
@@ -158,7 +162,7 @@ def _split(blocks: Array) -> tuple[Array, Array, Array]:
 
 
 def _scattered(blocks: Array, rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> sp.csc_array:
-    """Sum of dense blocks (q, a, b) at rows (q, a) and columns (q, b), those at -1 left out."""
+    """Sum of dense blocks (q, a, b) at rows (q, a) and columns (q, b), ignoring rows and columns -1."""
     row, column = np.broadcast_to(rows[:, :, None], blocks.shape), np.broadcast_to(columns[:, None, :], blocks.shape)
     used = (row >= 0) & (column >= 0)
     return sp.csc_array(sp.coo_array((blocks[used], (row[used], column[used])), shape=shape))

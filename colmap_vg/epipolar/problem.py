@@ -1,4 +1,4 @@
-"""What an epipolar adjustment works on: the matches of part of a graph, and which focal lengths are free."""
+"""Input of the epipolar adjustment: the matches of part of a graph, and which focal lengths are refined."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,30 +23,33 @@ BoolArray = NDArray[np.bool_]
 
 
 MIN_AXIAL = 0.3
-"""Cosine to the axis of rays that a radial term is taken out of."""
+"""Least cosine between the optical axis and a ray that is undistorted."""
 NEWTON_STEPS, MIN_SLOPE = 8, 0.1
+"""Newton steps to undistort a radius, and lower limit of the slope of the distortion polynomial in them."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpipolarProblem:
-    """Edges and matches of a part of a graph, and what of its cameras is free.
+    """Edges and matches of a part of a graph, with its cameras.
 
     Attributes
     ----------
     num_images : int
     edges : (m, 2) int64 array
     offsets : (m + 1,) int64 array
+        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``.
     bearings1, bearings2 : (k, 3) array
-        Unit rays taken with `focal_lengths`.
+        Unit rays of the matches, computed with `focal_lengths`.
     camera_idx : (n,) int64 array
-        Of each image, among those below; see `focal_groups`.
+        Camera of each image, a row of the arrays below; see `focal_groups`.
     focal_lengths : (c,) array
         Pixels.
     free_focals : (c,) bool array
+        Cameras whose focal length is refined.
     triplets : Triplets or None
-        Tracks that three images share; they tell the ratios of baselines.
+        Tracks shared by three images, which determine the ratios of baselines.
     keypoints1, keypoints2 : (k,) int array or None
-        Keypoints of the matches in image 1 and image 2.
+        Keypoint indices of the matches in image 1 and image 2.
     """
 
     num_images: int
@@ -66,13 +69,13 @@ class EpipolarProblem:
         return cut_rays(self.offsets, self.bearings1, self.bearings2)
 
     def matches(self, log_scales: Array) -> Matches:
-        """Bearings and pixel variances at logarithms (c,) of factors on the focal lengths."""
+        """Matches with the focal lengths multiplied by factors, given by their logarithms (c,)."""
         camera = self.camera_idx[self.edges].T
         focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
         return Matches(self._pieces, focal**-2.0, np.exp(-log_scales[camera]) if self.free_focals.any() else None)
 
     def without(self, dropped: BoolArray) -> "EpipolarProblem":
-        """The same without some edges."""
+        """The problem without the edges of a mask (m,)."""
         rows, offsets = rows_of_segments(self.offsets, np.flatnonzero(~dropped))
         triplets = None if self.triplets is None else self.triplets.without(dropped)
         return replace(
@@ -86,52 +89,52 @@ class EpipolarProblem:
             keypoints2=None if self.keypoints2 is None else self.keypoints2[rows],
         )
 
-    def straightened(self, radial_term: float, cameras: BoolArray) -> "EpipolarProblem":
-        """The same after a radial term, as COLMAP has it, was taken out of the rays of some cameras (c,)."""
+    def undistorted(self, radial_term: float, cameras: BoolArray) -> "EpipolarProblem":
+        """The problem after undistorting the rays of some cameras (c,) by a radial term as in COLMAP's models."""
         terms = np.where(cameras, radial_term, 0.0)[self.camera_idx]
         image = self.edges[segment_of_rows(self.offsets)]
         triplets = self.triplets
         if triplets is not None:
             seen_by = triplets.images[segment_of_rows(triplets.offsets)].T
             bearings = [
-                _straightened(rays.T, terms[images]).T for rays, images in zip(triplets.bearings, seen_by, strict=True)
+                _undistorted(rays.T, terms[images]).T for rays, images in zip(triplets.bearings, seen_by, strict=True)
             ]
             triplets = replace(triplets, bearings=np.stack(bearings))
         return replace(
             self,
-            bearings1=_straightened(self.bearings1, terms[image[:, 0]]),
-            bearings2=_straightened(self.bearings2, terms[image[:, 1]]),
+            bearings1=_undistorted(self.bearings1, terms[image[:, 0]]),
+            bearings2=_undistorted(self.bearings2, terms[image[:, 1]]),
             triplets=triplets,
         )
 
     def triplet_rays(self, triplets: Triplets, log_scales: Array) -> TripletRays:
-        """Rays and pixel variances of triplets at logarithms (c,) of factors on the focal lengths."""
+        """Rays of triplets with the focal lengths multiplied by factors, given by their logarithms (c,)."""
         camera = self.camera_idx[triplets.images].T
         focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
-        shrinks = np.exp(-log_scales[camera]) if self.free_focals.any() else None
-        return TripletRays(triplets.pieces, focal**-2.0, shrinks)
+        focal_ratios = np.exp(-log_scales[camera]) if self.free_focals.any() else None
+        return TripletRays(triplets.pieces, focal**-2.0, focal_ratios)
 
 
-def _straightened(rays: Array, radial_terms: Array) -> Array:
-    """Unit rays (k, 3) of points whose normalised coordinates ``u (1 + k |u|^2)`` the given ones show.
+def _undistorted(rays: Array, radial_terms: Array) -> Array:
+    """Undistorted unit rays (k, 3): the given ones have normalised coordinates ``u (1 + k |u|^2)``.
 
-    Rays far off the axis, which no polynomial reaches, stay as they are.
+    Rays far off the axis, where the polynomial is not valid, are returned unchanged.
     """
     z = rays[:, 2]
     near = z > MIN_AXIAL
-    shown = np.where(near, np.hypot(rays[:, 0], rays[:, 1]) / np.where(near, z, 1.0), 0.0)
-    radius = shown.copy()
-    # Where the term is negative the polynomial has a maximum, and nothing beyond it is shown.
+    distorted = np.where(near, np.hypot(rays[:, 0], rays[:, 1]) / np.where(near, z, 1.0), 0.0)
+    radius = distorted.copy()
+    # With a negative term the polynomial has a maximum, beyond which it is not invertible.
     limit = np.where(radial_terms < 0.0, np.sqrt(1.0 / np.maximum(-3.0 * radial_terms, 1e-12)), np.inf)
     for _ in range(NEWTON_STEPS):
         slope = np.maximum(1.0 + 3.0 * radial_terms * radius**2, MIN_SLOPE)
-        radius = np.clip(radius - (radius * (1.0 + radial_terms * radius**2) - shown) / slope, 0.0, limit)
-    factor = np.where(shown > 0.0, radius / np.where(shown > 0.0, shown, 1.0), 1.0)
+        radius = np.clip(radius - (radius * (1.0 + radial_terms * radius**2) - distorted) / slope, 0.0, limit)
+    factor = np.where(distorted > 0.0, radius / np.where(distorted > 0.0, distorted, 1.0), 1.0)
     return normalized(np.concatenate([rays[:, :2] * factor[:, None], z[:, None]], axis=1))
 
 
 def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) -> EpipolarProblem | None:
-    """The matches of a part of a graph; None where the graph holds no matches, or no cameras that say what a pixel is.
+    """Collect the matches of a part of a graph; None if the graph has no matches or no cameras.
 
     Parameters
     ----------
@@ -170,7 +173,7 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
             rays2[rows],
             graph.cam2_from_cam1_rotations[part.edge_rows],
         )
-    # Triplets come from all matches: thinned pairs share few tracks.
+    # Triplets are formed from all matches: subsampled pairs share few tracks.
     spread = well_spread(part_offsets, rays1[rows], options.max_matches_per_edge)
     rows, part_offsets = rows[spread], segment_subset(part_offsets, spread)
     camera_idx = group[camera_idx[part.images]]
@@ -192,10 +195,10 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
 
 
 def focal_groups(graph: ViewGraph) -> tuple[IntArray, IntArray]:
-    """Cameras that share their focal length in the adjustment: the same one, not known otherwise.
+    """Group cameras of the same unknown focal length, which share one focal length in the adjustment.
 
-    Photographs without EXIF get a camera each, and one focal length that all of them vote for. Few of them could tell
-    their own; bundle adjustment sets them free.
+    Photographs without EXIF have a camera each, with one focal length that all of them vote for. Few of them determine
+    their own; bundle adjustment refines them separately.
 
     Parameters
     ----------
@@ -204,15 +207,15 @@ def focal_groups(graph: ViewGraph) -> tuple[IntArray, IntArray]:
     Returns
     -------
     group : (c,) int64 array
-        Of each camera.
+        Group of each camera.
     first : (g,) int64 array
-        A camera of each group.
+        First camera of each group.
     """
     if graph.camera_focal_lengths is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     count = len(graph.camera_focal_lengths)
     known = np.zeros(count, dtype=bool) if graph.camera_focal_known is None else graph.camera_focal_known
-    # Cameras whose focal length is known stay by themselves.
+    # Cameras with known focal length form groups of their own.
     own = np.where(known, np.arange(count), -1)
     keys = np.stack([graph.camera_focal_lengths, own], axis=1)
     _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)

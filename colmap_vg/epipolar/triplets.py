@@ -1,8 +1,8 @@
-"""Triplets of images (a, b, c) that share tracks through b, chosen by how well they tell the ratio of two baselines.
+"""Selection of image triplets (a, b, c) with tracks through b, by their information on the ratio of two baselines.
 
-A half-edge is an edge seen from one of its images. Two half-edges of an image b that match the same keypoints make a
-triplet, whether or not a and c are matched. Its worth is ``sum sin(theta_a) sin(theta_c)`` over the shared keypoints,
-theta the angles between the rays of a point: the information on the ratio grows with both.
+A half-edge is an edge together with one of its images. Two half-edges of an image b that match the same keypoints form
+a triplet, whether or not a and c are matched. Its score is ``sum sin(theta_a) sin(theta_c)`` over the shared keypoints,
+with the angles theta between the rays of a point: the information on the ratio increases with both.
 """
 
 from dataclasses import dataclass, replace
@@ -21,29 +21,31 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 HALF_EDGES_PER_IMAGE = 24
-"""Half-edges of an image that are paired, those of most worth: pairs grow with the square of their number."""
+"""Maximum number of half-edges per image that are paired, those of highest score: the number of pairs is quadratic."""
 TRIPLETS_PER_IMAGE = 6
+"""Maximum number of triplets with the same middle image, apart from those of the spanning forest."""
 TRACKS_PER_TRIPLET = 60
+"""Maximum number of tracks per triplet."""
 MIN_TRACKS = 10
-"""Fewer shared keypoints make no triplet."""
+"""Minimum number of shared keypoints of a triplet."""
 
 
 @dataclass(frozen=True, eq=False)
 class Triplets:
-    """Triplets and their tracks.
+    """Image triplets with their tracks.
 
     Attributes
     ----------
     images : (q, 3) int64 array
-        a, b, c; b sees the tracks in both edges.
+        Images a, b, c; b is shared by both edges.
     edges : (q, 2) int64 array
-        The edges of a and b, and of b and c.
+        Rows of the edge between a and b, and of that between b and c.
     offsets : (q + 1,) int64 array
         Tracks of triplet k are rows ``offsets[k]:offsets[k + 1]``.
     bearings : (3, 3, k) array
-        Unit rays in a, b and c; components second.
+        Unit rays in a, b and c; the second axis holds the components.
     keypoints : (3, k) int64 array
-        Keypoints in a, b and c.
+        Keypoint indices in a, b and c.
     """
 
     images: IntArray
@@ -54,11 +56,11 @@ class Triplets:
 
     @cached_property
     def pieces(self) -> Pieces:
-        """The rays' nine columns."""
+        """Pieces of the nine components of the rays."""
         return Pieces.cut(self.offsets, list(self.bearings.reshape(9, -1)))
 
     def without(self, dropped: BoolArray) -> "Triplets":
-        """The same without those that use a dropped edge (m,), the edges left numbered anew."""
+        """Remove the triplets that use a dropped edge, given a mask (m,), and renumber the remaining edges."""
         kept = np.flatnonzero(~dropped[self.edges].any(axis=1))
         rows, offsets = rows_of_segments(self.offsets, kept)
         number = np.cumsum(~dropped) - 1
@@ -81,32 +83,34 @@ def find_triplets(
     bearings2: Array,
     relative_rotations: Array,
 ) -> Triplets:
-    """Choose triplets by the worth of their shared tracks.
+    """Select triplets by the score of their shared tracks.
 
     Parameters
     ----------
     edges : (m, 2) int64 array
     offsets : (m + 1,) int64 array
+        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``.
     keypoints1, keypoints2 : (k,) int array
-        Keypoints of the matches in image 1 and image 2.
+        Keypoint indices of the matches in image 1 and image 2.
     bearings1, bearings2 : (k, 3) array
+        Unit rays of the matches.
     relative_rotations : (m, 3, 3) array
-        cam2_from_cam1, to tell the angles between rays.
+        cam2_from_cam1 rotations, used for the angles between rays.
 
     Returns
     -------
     Triplets
-        At most `TRIPLETS_PER_IMAGE` about each image, with at most `TRACKS_PER_TRIPLET` tracks each.
+        About `TRIPLETS_PER_IMAGE` per middle image, with at most `TRACKS_PER_TRIPLET` tracks each.
     """
     m, k = len(edges), len(bearings1)
     turned = np.einsum("kab,kb->ka", relative_rotations[segment_of_rows(offsets)], bearings1)
     sine = np.linalg.norm(np.cross(turned, bearings2), axis=1)
-    # Half-edges: those of the first images, then those of the second; rows of matches likewise.
+    # Half-edges at the first images, then those at the second ones; rows of matches in the same order.
     middle, other = edges.T.ravel(), edges[:, ::-1].T.ravel()
     half_offsets = np.concatenate([offsets, offsets[1:] + k])
     keypoints = np.concatenate([keypoints1, keypoints2]).astype(np.int64)
     chosen = _best_of_each(middle, segment_sums(half_offsets, np.tile(np.square(sine), 2)), HALF_EDGES_PER_IMAGE)
-    pairs = _worthy_pairs(middle[chosen], other[chosen], half_offsets, keypoints, np.tile(sine, 2), chosen, m)
+    pairs = _select_pairs(middle[chosen], other[chosen], half_offsets, keypoints, np.tile(sine, 2), chosen, m)
     first, second = _join(pairs, half_offsets, keypoints)
     shared = np.concatenate([[0], np.cumsum(np.bincount(first[0], minlength=len(pairs)))]).astype(np.int64)
     kept = evenly_thinned(shared, TRACKS_PER_TRIPLET)
@@ -122,7 +126,7 @@ def find_triplets(
     )
 
 
-def _worthy_pairs(
+def _select_pairs(
     middle: IntArray,
     other: IntArray,
     half_offsets: IntArray,
@@ -131,10 +135,10 @@ def _worthy_pairs(
     chosen: IntArray,
     num_edges: int,
 ) -> IntArray:
-    """Pairs (q, 2) of half-edges that share keypoints of an image, the worthiest of each image, in rising order."""
+    """Pairs (q, 2) of half-edges that share keypoints, those of highest score of each image, in increasing order."""
     rows, offsets = rows_of_segments(half_offsets, chosen)
     image = middle[segment_of_rows(offsets)]
-    # A column for each keypoint of each image.
+    # One column per keypoint of each image.
     highest = np.zeros(int(middle.max(initial=0)) + 1, dtype=np.int64)
     np.maximum.at(highest, image, keypoints[rows] + 1)
     column = (np.cumsum(highest) - highest)[image] + keypoints[rows]
@@ -147,17 +151,17 @@ def _worthy_pairs(
     a, c = a[enough].astype(np.int64), c[enough].astype(np.int64)
     if len(a) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    worth = sp.csr_array(seen @ seen.T)
-    value = np.asarray(worth[a, c]).ravel()
+    products = sp.csr_array(seen @ seen.T)
+    score = np.asarray(products[a, c]).ravel()
     edge_a, edge_c = chosen[a] % num_edges, chosen[c] % num_edges
-    tree = _maximum_spanning_forest(edge_a, edge_c, value, num_edges)
-    best = np.union1d(_best_of_each(middle[a], value, TRIPLETS_PER_IMAGE), tree)
+    tree = _maximum_spanning_forest(edge_a, edge_c, score, num_edges)
+    best = np.union1d(_best_of_each(middle[a], score, TRIPLETS_PER_IMAGE), tree)
     return np.stack([chosen[a[best]], chosen[c[best]]], axis=1)
 
 
-def _maximum_spanning_forest(first: IntArray, second: IntArray, worth: Array, num_nodes: int) -> IntArray:
-    """Links (in rising order) that join all that can be joined, of most worth."""
-    order = np.argsort(worth, kind="stable")
+def _maximum_spanning_forest(first: IntArray, second: IntArray, score: Array, num_nodes: int) -> IntArray:
+    """Rows, in increasing order, of the links in the spanning forest of largest total score."""
+    order = np.argsort(score, kind="stable")
     links = sp.csr_array(
         (1.0 + np.arange(len(order))[::-1], (first[order], second[order])), shape=(num_nodes, num_nodes)
     )
@@ -166,7 +170,7 @@ def _maximum_spanning_forest(first: IntArray, second: IntArray, worth: Array, nu
 
 
 def _join(pairs: IntArray, half_offsets: IntArray, keypoints: IntArray) -> tuple[tuple[IntArray, IntArray], IntArray]:
-    """Matches that two half-edges have in common: (pair, row in the first), row in the second."""
+    """Matches that two half-edges share: (pair, row in the first half-edge), row in the second half-edge."""
     width = int(keypoints.max(initial=0)) + 1
     used = np.unique(pairs)
     rows, offsets = rows_of_segments(half_offsets, used)
@@ -181,8 +185,8 @@ def _join(pairs: IntArray, half_offsets: IntArray, keypoints: IntArray) -> tuple
     return (pair[hit], mine[hit]), sorted_rows[place[hit]]
 
 
-def _best_of_each(group: IntArray, worth: Array, limit: int) -> IntArray:
-    """Members of the highest worth in each group, at most `limit`, in rising order."""
-    order = np.lexsort((-worth, group))
+def _best_of_each(group: IntArray, score: Array, limit: int) -> IntArray:
+    """At most `limit` members of highest score in each group, in increasing order."""
+    order = np.lexsort((-score, group))
     starts = np.searchsorted(group[order], group[order], side="left")
     return np.sort(order[np.arange(len(order)) - starts < limit])

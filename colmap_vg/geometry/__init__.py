@@ -1,1 +1,1 @@
-"""Rotations, directions and similarities on arrays."""
+"""Operations on arrays of rotations, directions and similarities."""

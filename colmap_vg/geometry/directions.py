@@ -1,4 +1,4 @@
-"""Unit vectors in batches."""
+"""Operations on arrays of vectors and unit vectors."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,6 +1,6 @@
-"""Quaternions stored by component, (4, m) in the order x, y, z, w: the fast inner loop of robust averaging.
+"""Quaternions stored by component, (4, m) in the order x, y, z, w, for the inner loop of robust averaging.
 
-Each component is one contiguous row, so a product of 100,000 rotations is a few dozen vector operations; batched
+Each component is one contiguous row, so that a product of 100,000 rotations is a few dozen vector operations; batched
 3 x 3 products take several times longer.
 """
 
@@ -13,22 +13,22 @@ Array = NDArray[np.float64]
 
 
 def from_matrices(R: Array) -> Array:
-    """(m, 3, 3) to (4, m)."""
+    """Unit quaternions (4, m) of rotation matrices (m, 3, 3)."""
     return np.ascontiguousarray(so3.to_quaternion(R).T)
 
 
 def to_matrices(q: Array) -> Array:
-    """(4, m) to (m, 3, 3); normalised on the way."""
+    """Rotation matrices (m, 3, 3) of quaternions (4, m), which are normalised first."""
     return so3.from_quaternion(q.T)
 
 
 def conjugate(q: Array) -> Array:
-    """Inverse of unit quaternions."""
+    """Conjugates (4, m), the inverses of unit quaternions."""
     return np.stack([-q[0], -q[1], -q[2], q[3]])
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Hamilton products: the rotation of a after that of b."""
+    """Hamilton products (4, m): the rotation a applied after b."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     out = np.empty((4, max(a.shape[1], b.shape[1])))

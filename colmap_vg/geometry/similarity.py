@@ -1,4 +1,4 @@
-"""Similarity transformations and the best one between two sets of positions."""
+"""Similarity transformations, and least-squares alignment of positions."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x -> scale * rotation @ x + translation``.
+    """Similarity transformation ``x -> scale * rotation @ x + translation``.
 
     Attributes
     ----------
@@ -30,13 +30,13 @@ class Similarity:
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
     def inverse(self) -> "Similarity":
-        """The similarity that takes it back."""
+        """Inverse similarity."""
         back = self.rotation.T / self.scale
         return Similarity(1.0 / self.scale, self.rotation.T, -back @ self.translation)
 
 
 def align_positions(estimated: Array, truth: Array) -> tuple[Array, Similarity]:
-    """Distances left after the similarity that best maps estimated on true positions, over all cameras.
+    """Align estimated to true positions by the best similarity, and return the remaining distances.
 
     Minimises ``sum_i ||s R p_i + t - q_i||^2`` (eq. rts of Nasiri et al.) in closed form (Umeyama, PAMI 1991).
 
@@ -63,9 +63,9 @@ def align_positions(estimated: Array, truth: Array) -> tuple[Array, Similarity]:
             f"align_positions needs two (n, 3) arrays with n >= 1, found {estimated.shape} and {truth.shape}"
         )
     if not (np.isfinite(estimated).all() and np.isfinite(truth).all()):
-        raise GraphError("align_positions: positions hold NaN or infinite values; leave unregistered images out first")
+        raise GraphError("align_positions: positions have NaN or infinite values; remove unregistered images first")
     scales, rotations, translations = best_similarities(estimated[None], truth[None])
-    if not np.isfinite(scales[0]):  # one position, or all at one place
+    if not np.isfinite(scales[0]):  # one position, or all equal
         similarity = Similarity(1.0, rotations[0], truth.mean(axis=0) - rotations[0] @ estimated.mean(axis=0))
     else:
         similarity = Similarity(float(scales[0]), rotations[0], translations[0])
@@ -82,7 +82,7 @@ def best_similarities(estimated: Array, truth: Array) -> tuple[Array, Array, Arr
     Returns
     -------
     scales : (h,) array
-        NaN where all estimated positions of a set are one.
+        NaN where all estimated positions of a set are equal.
     rotations : (h, 3, 3) array
     translations : (h, 3) array
         ``truth ≈ scale rotation estimated + translation``.

@@ -1,7 +1,7 @@
 """Rotations in batches: exponential, logarithm, projection and angle on ``(..., 3, 3)`` arrays.
 
-Written out in numpy because scipy's ``Rotation`` is several times slower on hundreds of thousands of edges;
-tested against it. All angles are in radians. Tangent vectors are rotation vectors applied on the left,
+Implemented in numpy because scipy's ``Rotation``, against which it is tested, is several times slower on hundreds of
+thousands of edges. All angles are in radians. Tangent vectors are rotation vectors applied on the left,
 ``R <- exp(w) R``, unless a function says otherwise.
 """
 
@@ -61,7 +61,7 @@ def exp(w: Array) -> Array:
 def to_quaternion(R: Array) -> Array:
     """Unit quaternions (x, y, z, w), w >= 0, of rotation matrices: (..., 3, 3) to (..., 4).
 
-    The largest of the four components is taken from the diagonal (Shepperd), so nothing cancels near angle pi.
+    The largest of the four components is computed from the diagonal (Shepperd), to avoid cancellation near angle pi.
     """
     m = R.reshape(-1, 3, 3)
     trace = np.trace(m, axis1=1, axis2=2)
@@ -90,7 +90,7 @@ def from_quaternion(q: Array) -> Array:
 
 
 def log(R: Array) -> Array:
-    """Rotation vectors of rotation matrices, right at 0 and at pi.
+    """Rotation vectors of rotation matrices, accurate near angles 0 and pi.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def angle(R: Array) -> Array:
 
 
 def project(M: Array) -> Array:
-    """Nearest rotation in the Frobenius norm: the SVD with the sign of the determinant put on the last axis.
+    """Nearest rotations in the Frobenius norm, by SVD with the sign of the determinant on the last axis.
 
     Parameters
     ----------

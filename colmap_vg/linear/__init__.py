@@ -1,1 +1,1 @@
-"""Sparse symmetric systems on graphs: assembly on a fixed pattern and one adapter to the solvers."""
+"""Sparse symmetric systems on graphs: assembly with a fixed pattern, solvers, eigenvalues, and robust weights."""

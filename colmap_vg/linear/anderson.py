@@ -9,22 +9,24 @@ Array = NDArray[np.float64]
 
 
 class AndersonMixer:
-    """Proposes the next point of ``x <- g(x)`` from the last few points and images.
+    """Anderson acceleration of ``x <- g(x)`` from the last few points and images.
 
-    The proposal is only a guess: the caller iterates ``g`` on it, so the fixed point is the plain iteration's own. When
-    the residual ``||g(x) - x||`` grows by more than `max_growth` over the best one, the memory is thrown away and the
-    plain step is taken.
+    The caller applies ``g`` to the proposed point, so that the fixed points are those of the plain iteration. If the
+    residual ``||g(x) - x||`` exceeds the best one by more than `max_growth`, the memory is cleared and the plain step
+    is taken.
 
-    A mode that the plain iteration lets grow on its way to a far fixed point looks to the mixer like one to be undone:
-    it would hold the iteration near a point that repels. So, where the residual has not halved in `patience` proposals,
-    plain steps follow until it is a tenth.
+    Acceleration also suppresses modes that the plain iteration amplifies on its way to a distant fixed point, and can
+    stay near a repelling point. Therefore, if the residual has not halved in `patience` proposals, plain steps follow
+    until it has decreased to a tenth.
 
     Parameters
     ----------
     depth : int
-        Differences remembered.
+        Number of differences in memory.
     max_growth : float
+        Largest ratio of the residual to the best one, dimensionless.
     patience : int
+        Number of proposals in which the residual must halve.
     """
 
     def __init__(self, depth: int = 8, max_growth: float = 2.0, patience: int = 20) -> None:
@@ -35,7 +37,7 @@ class AndersonMixer:
         self._goal, self._since, self._plain_above = np.inf, 0, np.inf
 
     def propose(self, x: Array, image: Array) -> Array:
-        """Next point after ``image = g(x)``, flat arrays."""
+        """Propose the next point after ``image = g(x)``; all arrays are flat."""
         residual = image - x
         norm = float(np.linalg.norm(residual))
         if norm > self._plain_above:
@@ -72,25 +74,26 @@ def fixed_point(
     tolerance: float,
     on_iteration: Callable[[int, Array, float], None],
 ) -> tuple[Array, int, bool]:
-    """Iterate ``x <- step(x)`` until the plain step changes x by at most `tolerance`, relative.
+    """Iterate ``x <- step(x)`` until the relative change of x in a plain step is at most `tolerance`.
 
     Parameters
     ----------
     step : callable
         Takes and returns an array of x's shape.
     x : array
+        Initial point.
     accelerate : bool
-        Anderson acceleration; the test of convergence stays the plain step's.
+        Whether to use Anderson acceleration; convergence is judged on the plain step.
     max_num_iterations : int
     tolerance : float
-        On ``||step(x) - x|| / ||x||``.
+        Limit of ``||step(x) - x|| / ||x||`` at convergence.
     on_iteration : callable
-        Told the iteration, ``step(x)`` and its relative change.
+        Called with the iteration, ``step(x)`` and its relative change.
 
     Returns
     -------
     x : array
-        ``step`` of the last point.
+        Image ``step(x)`` of the last point.
     num_iterations : int
     converged : bool
     """

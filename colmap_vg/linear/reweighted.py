@@ -1,7 +1,7 @@
-"""Graph Laplacians whose weights change and whose pattern does not: one sorted pattern, one stale factor.
+"""Graph Laplacians with changing weights and a fixed pattern, for iteratively reweighted least squares.
 
-In a reweighting loop the weights settle, so an old factor stays a good preconditioner: conjugate gradients with it need
-a few products instead of a new factor (0.45 x of the time at 5,000 to 30,000 cameras).
+As the weights converge, an old factorisation remains a good preconditioner: conjugate gradients with it need a few
+products instead of a new factorisation (0.45 x of the time at 5,000 to 30,000 cameras).
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ IntArray = NDArray[np.int64]
 
 
 class ReweightedLaplacian:
-    """Solves ``B^T diag(w) B x = b`` on a connected graph for changing weights w.
+    """Solver of ``B^T diag(w) B x = b`` on a connected graph for changing weights w.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ class ReweightedLaplacian:
     edges : (m, 2) int array
         Parallel edges are summed.
     max_cg_iterations : int
-        When conjugate gradients under the stale factor take more than this, the matrix is factored anew.
+        Number of conjugate-gradient iterations with the old factorisation after which the matrix is factored again.
     """
 
     def __init__(self, num_nodes: int, edges: IntArray, max_cg_iterations: int = 12) -> None:
@@ -41,7 +41,7 @@ class ReweightedLaplacian:
         self._factor: Factor | None = None
 
     def matrix(self, weights: Array, ground: float = 0.0) -> sp.csc_array:
-        """The Laplacian (n, n) of weights (m,), with `ground` times the first node's degree added there."""
+        """Laplacian (n, n) of weights (m,), with `ground` times the first node's degree added to its diagonal entry."""
         off = np.bincount(self._pair, weights=weights, minlength=self._num_pairs)
         degree = self.degrees(weights)
         degree[0] += ground * degree[0]
@@ -55,7 +55,7 @@ class ReweightedLaplacian:
         return np.asarray(first + np.bincount(self._j, weights=weights, minlength=n), dtype=np.float64)
 
     def divergence(self, flow: Array) -> Array:
-        """``B^T flow``: what flows (k, m) along edges leave at the nodes, (n, k)."""
+        """Divergence ``B^T flow`` (n, k) at the nodes of flows (k, m) along edges."""
         n = self.num_nodes
         return np.stack(
             [np.bincount(self._j, weights=f, minlength=n) - np.bincount(self._i, weights=f, minlength=n) for f in flow],
@@ -63,7 +63,7 @@ class ReweightedLaplacian:
         )
 
     def solve(self, weights: Array, b: Array, relative_tolerance: float = 1e-6) -> Array:
-        """Solution of mean zero.
+        """Solve for the solution of mean zero.
 
         Parameters
         ----------
@@ -72,19 +72,19 @@ class ReweightedLaplacian:
         b : (n, k) array
             Each column sums to zero.
         relative_tolerance : float
-            Of the residual's Frobenius norm, where the stale factor serves; a new factor solves to rounding.
+            Frobenius norm of the residual over that of b, with the old factorisation; a new one solves to rounding.
 
         Returns
         -------
         (n, k) array
         """
-        # Grounding one node makes the matrix definite and leaves the solution: with columns of sum zero, x_0 = 0.
+        # Grounding one node makes the matrix definite and keeps the solution: for columns of sum zero, x_0 = 0.
         A = self.matrix(weights, ground=1.0)
         x = None
         if self._factor is not None:
             x = conjugate_gradients(A, b, self._factor, relative_tolerance, self._max_cg_iterations)
         if x is None:
-            self._factor = None  # frees the old factor before the new one is made
+            self._factor = None  # frees the old factorisation before the new one is computed
             self._factor = factorize(A)
             x = self._factor.solve(b)
         return np.asarray(x - x.mean(axis=0))
@@ -93,9 +93,10 @@ class ReweightedLaplacian:
 def conjugate_gradients(
     A: sp.csc_array, b: Array, preconditioner: Factor, relative_tolerance: float, max_iterations: int
 ) -> Array | None:
-    """Preconditioned conjugate gradients, or None where the limit is reached.
+    """Solve by preconditioned conjugate gradients; None if the iteration limit is reached.
 
-    The columns of b share their step lengths, as one long system: turn the rows of b, and the result turns with them.
+    All columns of b share their step lengths, as one long system, so that the result is equivariant under rotations of
+    the rows of b.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def conjugate_gradients(
         Symmetric positive definite.
     b : (n, k) array
     preconditioner : Factor
-        Of a matrix near A.
+        Factorisation of a matrix close to A.
     relative_tolerance : float
         Frobenius norm of the residual over that of b.
     max_iterations : int

@@ -1,8 +1,8 @@
-"""One adapter to direct solvers for symmetric positive definite systems.
+"""Direct solvers for symmetric positive definite systems behind one interface.
 
-scipy's SuperLU is set up for such matrices (minimum degree on A + A^T, no pivoting off the diagonal), which is three to
-four times faster than its default on viewing graphs. Where the matrix is tiny, or large and nearly full, LAPACK's
-Cholesky wins.
+scipy's SuperLU is configured for such matrices (minimum degree on A + A^T, no pivoting off the diagonal), which is
+three to four times faster than its default on viewing graphs. For tiny matrices, and for large and nearly full ones,
+LAPACK's Cholesky factorisation is faster.
 """
 
 from typing import Protocol
@@ -18,10 +18,11 @@ from colmap_vg.errors import GraphError
 Array = NDArray[np.float64]
 
 DENSE_BELOW = 300
-"""Up to this many unknowns LAPACK, with one thread, is faster than building a sparse factor of any fill."""
+"""Number of unknowns up to which LAPACK, with one thread, is faster than a sparse factorisation of any fill."""
 DENSE_FILL, DENSE_LIMIT = 0.1, 12_000
-"""From this share of nonzeros on, up to so many unknowns, LAPACK is faster than SuperLU: 29 against 88 ms on 1,000
-full ones. At 7 % SuperLU takes 19 to 64 ms for 1,800 unknowns, by the share of long loops, and LAPACK 55 to 60."""
+"""Share of nonzeros above which, up to this number of unknowns, LAPACK is faster than SuperLU: 29 ms instead of 88 ms
+for 1,000 unknowns and a full matrix. At 7 % and 1,800 unknowns SuperLU takes 19 to 64 ms, depending on the share of
+long loops, and LAPACK 55 to 60 ms."""
 
 
 class Factor(Protocol):
@@ -48,10 +49,10 @@ class _SuperLUFactor:
             self._factor = spla.splu(
                 matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
             )
-        except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
+        except RuntimeError as error:  # raised by SuperLU for exactly singular matrices
             raise SingularMatrixError(str(error)) from error
         if check_definite:
-            # Pivots have the signs of the eigenvalues (Sylvester) as long as rows and columns were permuted alike.
+            # The pivots have the signs of the eigenvalues (Sylvester) if rows and columns were permuted alike.
             f = self._factor
             if not (np.array_equal(f.perm_r, f.perm_c) and (f.U.diagonal() > 0).all()):
                 raise SingularMatrixError("the matrix is not positive definite")
@@ -61,7 +62,7 @@ class _SuperLUFactor:
 
 
 class SingularMatrixError(GraphError):
-    """The system is singular: part of the graph is not fixed by its edges."""
+    """Raised for singular systems: the edges do not determine part of the graph."""
 
 
 def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
@@ -72,7 +73,7 @@ def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
     matrix : (n, n) csc_array
         Both triangles stored.
     check_definite : bool
-        Refuse indefinite matrices on the sparse path too, at the cost of a copy of the factor.
+        Whether to reject indefinite matrices on the sparse path, too, at the cost of a copy of the factor.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""One BLAS thread for the numerics: the same bits on any machine, and no waiting.
+"""Restriction of BLAS to one thread, for reproducible results and speed.
 
-The matrices of viewing graphs are small: BLAS threads gain little on them, and where other jobs keep the cores busy
-they wait for each other at every call (a Cholesky factor of 600 unknowns took up to 1.4 s with them, 6 ms without).
+The matrices of viewing graphs are small: BLAS threads gain little on them and, on busy cores, wait for each other at
+every call (a Cholesky factorisation of 600 unknowns took up to 1.4 s with several threads, 6 ms with one).
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ T = TypeVar("T")
 
 @cache
 def _controller() -> ThreadpoolController:
-    return ThreadpoolController()  # it searches the loaded libraries: 5 ms, once
+    return ThreadpoolController()  # searches the loaded libraries, which takes 5 ms
 
 
 def single_threaded_blas(function: Callable[P, T]) -> Callable[P, T]:
-    """Run a function with one BLAS thread."""
+    """Decorate a function to run with one BLAS thread."""
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> T:

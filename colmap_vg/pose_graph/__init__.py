@@ -1,1 +1,1 @@
-"""Rotations and positions together, from relative poses."""
+"""Pose-graph optimisation: rotations and positions jointly, from relative poses."""

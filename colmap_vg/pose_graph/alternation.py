@@ -1,19 +1,18 @@
-"""Algorithm 2 of Nasiri et al.: repeated pose-graph optimisation with the scale factors of the last positions.
+"""Algorithm 2 of Nasiri et al.: iterated pose-graph optimisation with scale factors from the previous positions.
 
 Each outer iteration sets ``lambda_ij = ||p_j - p_i||`` and solves PS for translations ``lambda_ij gamma^l_ij`` with
 rotation weight 1 and position weight ``w_ij = 1`` (**2C**, displacement error) or ``1 / ||p_j - p_i||^2`` (**2O**,
-direction error); then the centroid goes to 0 and ``sum ||p||^2`` back to what the start had, and cameras stay within
-the start's reach, as in Alg. 1. In 2C that scale is the
-weight between the two terms; 2O does not depend on it.
+direction error). Then the centroid is set to 0, ``sum ||p||^2`` to its initial value, and the cameras' distances from
+the centroid are limited, as in Alg. 1. In 2C that scale is the weight between the two terms; 2O does not depend on it.
 
-With information matrices (**2W**, the weighted form) the terms are whitened by them, the displacement's after division
-by the length, and edges count the less the farther they lie from what their information promises. Lengths and weights
-stand still within an outer iteration, as in 2O: that leaves a pull along the edge in place which minimising the
-direction errors themselves lacks, where noise then stretches what hangs loosely (eight to thirty times the error of 2O
-on simulated streets of 370 and 450 images).
+With information matrices (**2W**, the weighted form) both terms are whitened, the displacement after division by the
+length, and edges with large whitened residuals are down-weighted. Lengths and weights are fixed within an outer
+iteration, as in 2O, which keeps a restoring force along the edge. Direct minimisation of the direction errors lacks it,
+so that noise stretches weakly connected parts (eight to thirty times the error of 2O on simulated streets of 370 and
+450 images).
 
-The inner problem is solved as exactly as the outer change of the moment deserves, so the fixed point is that of exact
-inner solves; Anderson acceleration works on rotation vectors and positions together.
+The accuracy of the inner solves follows the current outer change, so that the fixed point is that of exact inner
+solves. Anderson acceleration is applied to rotation vectors and positions jointly.
 """
 
 from dataclasses import dataclass, replace
@@ -41,24 +40,25 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MEDIAN_OF_FIVE = 4.3515
-"""Median of the sum of squares of five normal deviates: an edge's whitened residual."""
+"""Median of the chi-square distribution with five degrees of freedom, that of an edge's squared whitened residual."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """Rotations and positions solved together.
+    """Jointly solved rotations and positions, with convergence information.
 
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
     projection_centers : (n, 3) array
-        Centroid 0, spread of the start.
+        World frame, centroid 0, with the spread of the initial positions.
     cost : float
-        PS's objective at the last scale factors.
+        Objective of PS at the last scale factors.
     num_iterations : int
-        Outer ones.
+        Number of outer iterations.
     converged : bool
     log : tuple of LogEntry
+        One entry per outer iteration.
     """
 
     cam_from_world_rotations: Array
@@ -86,7 +86,7 @@ def solve_joint(
     max_num_iterations: int = 1000,
     tolerance: float = 1e-10,
 ) -> JointResult:
-    """Alg. 2C or 2O from given rotations and positions, usually those of RS and CLS.
+    """Solve for rotations and positions by Alg. 2C or 2O from initial ones, usually those of RS and CLS.
 
     Parameters
     ----------
@@ -96,25 +96,29 @@ def solve_joint(
     cam2_in_cam1_directions : (m, 3) array
         Unit ``gamma^l_ij``, camera 1's frame.
     initial_rotations : (n, 3, 3) array
-        cam_from_world.
+        cam_from_world rotations.
     initial_centers : (n, 3) array
+        Projection centres, world frame.
     approach : "C" or "O"
+        Displacement or direction error.
     weights : (m,) array, optional
         Multipliers of both terms, default 1 (the paper).
     rotation_weights : (m,) array, optional
-        Further multipliers of the rotation term alone, default 1 (the paper).
+        Further multipliers of the rotation term only, default 1 (the paper).
     information : (m, 5, 5) array, optional
-        What each edge knows of its rotation (vector in camera 2's frame) and direction (in ``tangent_basis`` of it),
-        as :class:`colmap_vg.two_view.edge_information.RefinedEdges` holds it. It takes the place of the paper's equal
-        weights (its open question); `weights` multiply it, `rotation_weights` its rotation block.
+        Information matrix of each edge's rotation (vector in camera 2's frame) and direction (in its
+        ``tangent_basis``), as in :class:`colmap_vg.two_view.edge_information.RefinedEdges`. It replaces the paper's
+        equal weights (its open question); `weights` multiply it, `rotation_weights` its rotation block.
     robust : bool
-        With `information`: multiply each edge's by the Cauchy weight of its whitened residual, at a scale that follows
-        the median edge, so that information that is right but for a factor serves as well.
+        With `information`: multiply the information of each edge by the Cauchy weight of its whitened residual, at a
+        scale that follows the median edge. Information that is correct up to a factor then suffices.
     accelerate : bool
+        Whether to use Anderson acceleration.
     max_num_iterations : int
-        Outer iterations.
+        Maximum number of outer iterations.
     tolerance : float
-        On the relative change of rotations (radians) and positions that one plain outer iteration makes.
+        Change of rotations (radians) and positions (relative) in one plain outer iteration below which the iteration
+        ends.
 
     Returns
     -------
@@ -135,7 +139,7 @@ def solve_joint(
     shortest, shortest_weighted = MIN_RELATIVE_LENGTH * unit, shortest_weighted_length(start_p, edges)
     reach = farthest_allowed(start_p)
     log: list[LogEntry] = []
-    # The plain form solves every inner problem well, as the paper has it; the accelerated one as the moment deserves.
+    # The plain form solves every inner problem accurately, as in the paper; the accelerated one as the change requires.
     inner_tolerance, last_cost, shrinkage = 1e-3 if accelerate else 1e-6, np.inf, 1.0
 
     def pack(Q: Array, p: Array) -> Array:
@@ -159,10 +163,10 @@ def solve_joint(
             cost = InformationCost(edges, cam2_from_cam1_rotations, translations, weighted)
             if robust:
                 cost = replace(cost, information=weighted * _cauchy_weights(cost, Q, p)[:, None, None])
-        # At the fixed point the inner minimum is p, shrunk as in the last turn: from there few steps are left.
+        # Near the fixed point the inner minimum is p, scaled as in the last iteration: start there to save steps.
         Q, p, inner = solver.solve(cost, Q, p * shrinkage, tolerance=inner_tolerance)
         last_cost = inner.cost
-        # The global rotation is free: hold the first camera, so that the iteration has one fixed point.
+        # The global rotation is free: fix the first camera, so that the fixed point is unique.
         turn = start_Q[0] @ Q[0].T
         Q, p = turn @ Q, centered(p @ turn.T)
         shrinkage = spread(p) / size
@@ -187,7 +191,7 @@ def solve_joint(
 
 
 def _cauchy_weights(cost: InformationCost, Q: Array, p: Array) -> Array:
-    """Of whole edges, (m,), at the scale that the median edge tells."""
+    """Cauchy weights (m,) of the edges' whitened residuals, at a scale from the median edge."""
     e = cost.residuals(Q, p)
     squared = np.einsum("ka,kab,kb->k", e, cost.information, e, optimize=True)
     variance = max(float(np.median(squared)) / MEDIAN_OF_FIVE, np.finfo(np.float64).tiny)
@@ -195,10 +199,11 @@ def _cauchy_weights(cost: InformationCost, Q: Array, p: Array) -> Array:
 
 
 def _spatial_information(information: Array, directions: Array) -> Array:
-    """Information on rotation vectors and on vectors along directions, (m, 6, 6).
+    """Information matrices (m, 6, 6) of rotation vectors and displacements over their lengths.
 
-    A direction knows nothing of its own length, but without a term along it the scale factors would not hold the
-    positions apart: there the mean of its two tangents stands in, so that isotropic information gives the paper's cost.
+    A direction has no information on its length, but without a term along it the scale factors would not keep the
+    positions apart. The mean of the two tangential entries is used, so that isotropic information gives the paper's
+    cost.
     """
     lift = np.zeros((len(directions), 6, 5))
     lift[:, :3, :3] = np.eye(3)

@@ -1,7 +1,7 @@
-"""Objectives of pose-graph optimisation, each with the gradient and Hessian blocks of its edges.
+"""Objectives of pose-graph optimisation, with the gradient and Hessian blocks of each edge.
 
 With ``Q_i`` camera to world (``cam_from_world`` transposed), ``R_ij`` the measured ``cam2_from_cam1`` rotation and
-``t_ij`` the measured centre of camera j in camera i's frame, two objectives are here:
+``t_ij`` the measured centre of camera j in camera i's frame, there are two objectives:
 
 * :class:`ChordalCost`, with a scalar weight for each term (eq. PGO of Nasiri et al.)::
 
@@ -11,7 +11,7 @@ With ``Q_i`` camera to world (``cam_from_world`` transposed), ``R_ij`` the measu
 
       sum e^T Omega_ij e,   e = [log(Q_j^T Q_i R_ij^T), Q_i^T (p_j - p_i) - t_ij]
 
-  the rotation vector in camera j's frame first. For small angles ``Omega = diag(2 kappa I, tau I)`` is the first one.
+  with the rotation vector in camera j's frame. For small angles ``Omega = diag(2 kappa I, tau I)`` gives the first one.
 
 Derivatives are by ``w`` and ``x`` in ``Q <- exp(w) Q, p <- p + x``.
 """
@@ -28,12 +28,13 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MIN_TRACE = 1.5
-"""Below this trace (about 75 degrees) the chordal Hessian loses definiteness and the Gauss-Newton one stands in."""
+"""Trace of the residual rotation (about 75 degrees) below which the chordal Hessian, close to losing definiteness, is
+replaced by the Gauss-Newton one."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeTerms:
-    """Derivatives of each edge's cost by the poses of its two cameras, rotation first.
+    """Derivatives of each edge's cost by the poses of its two cameras i and j, rotation before position.
 
     Attributes
     ----------
@@ -41,7 +42,7 @@ class EdgeTerms:
     ii, jj, ij : (m, 6, 6) array
         Positive semidefinite approximation of the Hessian.
     curvature_ii, curvature_jj, curvature_ij : (m, 3, 3) array or None
-        What its rotation blocks lack of the exact Hessian; it may be indefinite.
+        Difference of the rotation blocks between the exact Hessian and the approximation; may be indefinite.
     """
 
     gradient_i: Array
@@ -55,7 +56,7 @@ class EdgeTerms:
 
 
 class PoseGraphCost(Protocol):
-    """What the solver of :mod:`colmap_vg.pose_graph.gauss_newton` minimises."""
+    """Objective for the solver of :mod:`colmap_vg.pose_graph.gauss_newton`."""
 
     def value(self, Q: Array, p: Array) -> float:
         """The objective at camera-to-world rotations Q (n, 3, 3) and centres p (n, 3)."""
@@ -66,7 +67,7 @@ class PoseGraphCost(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ChordalCost:
-    """Chordal rotations and weighted translations.
+    """Weighted sum of squared chordal rotation residuals and squared translation residuals.
 
     Attributes
     ----------
@@ -103,11 +104,11 @@ class ChordalCost:
         gradient_i = np.concatenate([turn + np.cross(s, pull), pull], axis=1)
         gradient_j = np.concatenate([-turn, -pull], axis=1)
 
-        # Exact Hessian of the chordal term by u while it is safely definite, Gauss-Newton's of the translations.
+        # Exact Hessian of the chordal term by u while it is safely definite, Gauss-Newton Hessian of the translations.
         trace = np.trace(M, axis1=1, axis2=2)[:, None, None]
         exact = trace * np.eye(3) - 0.5 * (M + np.swapaxes(M, 1, 2))
-        bent = 2.0 * self.kappa[:, None, None] * exact
-        C = np.where(trace > MIN_TRACE, bent, 4.0 * self.kappa[:, None, None] * np.eye(3))
+        chordal_hessian = 2.0 * self.kappa[:, None, None] * exact
+        C = np.where(trace > MIN_TRACE, chordal_hessian, 4.0 * self.kappa[:, None, None] * np.eye(3))
         S, weight = so3.hat(s), 2.0 * self.tau[:, None, None]
         ii, jj, ij = (np.zeros((len(s), 6, 6)) for _ in range(3))
         ii[:, :3, :3] = C + weight * (np.swapaxes(S, 1, 2) @ S)
@@ -118,10 +119,10 @@ class ChordalCost:
         ij[:, :3, :3] = -C
         ij[:, :3, 3:] = -weight * S
         ij[:, 3:, 3:] = -weight * np.eye(3)
-        # exp(-w_j) exp(w_i) turns by w_i - w_j - (w_j x w_i) / 2 + ..., and Q_i t moves by w_i x (w_i x s) / 2 as well.
+        # exp(-w_j) exp(w_i) rotates by w_i - w_j - (w_j x w_i) / 2 + ...; Q_i t changes by w_i x (w_i x s) / 2, too.
         outer = pull[:, :, None] * s[:, None, :]
         along = np.einsum("ka,ka->k", pull, s)[:, None, None] * np.eye(3)
-        curvature_jj = bent - C
+        curvature_jj = chordal_hessian - C
         curvature_ii = 0.5 * (outer + np.swapaxes(outer, 1, 2)) - along + curvature_jj
         curvature_ij = 2.0 * self.kappa[:, None, None] * so3.hat(skew) - curvature_jj
         return EdgeTerms(gradient_i, gradient_j, ii, jj, ij, curvature_ii, curvature_jj, curvature_ij)
@@ -129,7 +130,7 @@ class ChordalCost:
 
 @dataclass(frozen=True, eq=False)
 class InformationCost:
-    """Squared Mahalanobis lengths of relative-pose residuals.
+    """Sum of squared Mahalanobis lengths of relative-pose residuals.
 
     Attributes
     ----------
@@ -146,7 +147,7 @@ class InformationCost:
     information: Array
 
     def residuals(self, Q: Array, p: Array) -> Array:
-        """``[log(Q_j^T Q_i R_ij^T), Q_i^T (p_j - p_i) - t_ij]``, (m, 6)."""
+        """Residuals ``[log(Q_j^T Q_i R_ij^T), Q_i^T (p_j - p_i) - t_ij]``, (m, 6)."""
         i, j = self.edges[:, 0], self.edges[:, 1]
         turn = np.swapaxes(Q[j], 1, 2) @ Q[i] @ np.swapaxes(self.cam2_from_cam1_rotations, 1, 2)
         translation = np.einsum("kba,kb->ka", Q[i], p[j] - p[i])

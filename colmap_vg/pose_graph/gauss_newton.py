@@ -1,10 +1,10 @@
 """PS: pose-graph optimisation on SE(3), rotations and positions in one least-squares problem (eq. PGO).
 
 The objectives are in :mod:`colmap_vg.pose_graph.costs`. Steps ``Q <- exp(w) Q, p <- p + x`` are Levenberg-Marquardt
-ones on sparse 6 x 6 blocks, Newton's near the end, with the first camera held; a step that raises the cost is refused.
-Where cost differences drown in rounding the gradient decides, so that the minimum is reached to rounding and not to its
-square root. Newton's systems are solved by conjugate gradients under the last factor as long as it serves: Alg. 2 calls
-for hundreds of problems that differ little.
+steps on sparse 6 x 6 blocks, and Newton steps near convergence, with the first camera fixed; steps that increase the
+cost are rejected. If cost differences are below rounding, the gradient decides, so that the minimum is accurate to
+rounding and not to its square root. Newton systems are solved by conjugate gradients, preconditioned by the last
+factorisation as long as that converges fast: Alg. 2 solves hundreds of similar problems.
 """
 
 from collections.abc import Iterator
@@ -27,23 +27,26 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
-"""Shares of the Hessian's diagonal."""
+"""Least and largest damping, as shares of the Hessian's diagonal."""
 NEWTON_BELOW = 1e-2
-"""Size of the gradient from which on the exact Hessian is tried: Gauss-Newton's took 50 to 100 steps to the end."""
+"""Size of the gradient, dimensionless, below which the exact Hessian is tried: Gauss-Newton took 50 to 100 steps to
+converge."""
 CG_TOLERANCE, MAX_CG_ITERATIONS = 1e-4, 12
-"""Relative residual of Newton's systems under a stale factor, and products after which it is made anew."""
+"""Relative residual of Newton systems solved with an old factorisation, and number of iterations after which the matrix
+is factored again."""
 COST_ROUNDING = 1e-12
-"""Relative differences of costs below this are rounding: sums over up to a million edges."""
+"""Relative cost differences below this are due to rounding in sums over up to a million edges."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseGraphResult:
-    """Poses of a pose graph.
+    """Poses that minimise a pose-graph cost, with convergence information.
 
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
     projection_centers : (n, 3) array
+        World frame, in the unit of the translations.
     cost : float
     gradient : float
         Largest entry of the cost's gradient over the largest diagonal entry of its Hessian: radians for rotations,
@@ -64,7 +67,7 @@ class PoseGraphResult:
 
 @dataclass(frozen=True, eq=False)
 class _Linearization:
-    """Gradient (n, 6) at the cameras, its size, the edges' terms, and the Hessian's diagonal (n, 6)."""
+    """Gradient (n, 6) by the poses and its size, derivatives of each edge, and diagonal (n, 6) of the Hessian."""
 
     gradient: Array
     terms: EdgeTerms
@@ -73,7 +76,7 @@ class _Linearization:
 
 
 class PoseGraphSolver:
-    """Minimises pose-graph costs on one graph, whose sparsity pattern is sorted once.
+    """Solver of pose-graph problems on one graph, whose sparsity pattern is analysed once.
 
     Parameters
     ----------
@@ -99,7 +102,7 @@ class PoseGraphSolver:
     def solve(
         self, cost: PoseGraphCost, Q: Array, p: Array, *, max_num_iterations: int = 100, tolerance: float = 1e-12
     ) -> tuple[Array, Array, PoseGraphResult]:
-        """Minimise from camera-to-world rotations Q (n, 3, 3) and centres p (n, 3).
+        """Minimise a cost from initial camera-to-world rotations Q (n, 3, 3) and centres p (n, 3).
 
         Returns
         -------
@@ -120,7 +123,7 @@ class PoseGraphSolver:
                 new_at = self._linearize(cost, new_Q, new_p)
                 accepted = new_value < value - COST_ROUNDING * value or new_at.size < at.size
                 damping = max(trial_damping / 100.0, MIN_DAMPING)
-                break  # where rounding is reached, shorter steps would not tell either
+                break  # at the level of rounding shorter steps would not help either
             if not accepted:
                 break
             Q, p, value, at = new_Q, new_p, new_value, new_at
@@ -144,13 +147,13 @@ class PoseGraphSolver:
         return _Linearization(gradient, terms, diagonal, float(max(turn, shift)))
 
     def _trial_steps(self, at: _Linearization, damping: float) -> Iterator[tuple[float, Array]]:
-        """Steps (n, 6) to be tried in turn: Newton's where it may serve, then Levenberg's with growing damping."""
+        """Yield trial steps (n, 6): a Newton step near convergence, then Levenberg steps with increasing damping."""
         terms = at.terms
         if at.size < NEWTON_BELOW and terms.curvature_ii is not None:
             step = self._newton_step(at)
             if step is not None and np.vdot(step, at.gradient) < 0.0:
                 yield damping, step
-            self._stale = None  # refused: the factor may be that of an indefinite matrix
+            self._stale = None  # rejected: the factored matrix may have been indefinite
         while damping <= MAX_DAMPING:
             step = self._damped_step(at, damping)
             if step is not None:
@@ -158,7 +161,7 @@ class PoseGraphSolver:
             damping *= 100.0
 
     def _newton_step(self, at: _Linearization) -> Array | None:
-        """Step by the exact Hessian; None where it is not definite."""
+        """Newton step with the exact Hessian; None if it is not positive definite."""
         terms = at.terms
         if terms.curvature_ii is None or terms.curvature_jj is None or terms.curvature_ij is None:
             return None
@@ -172,7 +175,7 @@ class PoseGraphSolver:
         if self._stale is not None:
             step = conjugate_gradients(matrix, right, self._stale, CG_TOLERANCE, MAX_CG_ITERATIONS)
         if step is None:
-            self._stale = None  # frees the old factor before the new one is made
+            self._stale = None  # frees the old factorisation before the new one is computed
             try:
                 self._stale = factorize(matrix)
             except SingularMatrixError:
@@ -189,7 +192,7 @@ class PoseGraphSolver:
 
     def _matrix(self, at: _Linearization, ii: Array, jj: Array, ij: Array, damping: float) -> sp.csc_array:
         level = damping * at.diagonal + MIN_DAMPING * at.diagonal.max(axis=0)
-        # The gauge leaves six directions free; extra stiffness at one camera fixes them and bends nothing else.
+        # The gauge leaves six degrees of freedom; extra stiffness at one camera fixes them without affecting the shape.
         level[0] += at.diagonal[0] + at.diagonal.mean(axis=0)
         return self._pattern.assemble(ii, jj, ij, level[:, :, None] * np.eye(6))
 
@@ -217,23 +220,24 @@ def solve_pose_graph(
         The graph must be connected.
     cam2_from_cam1_rotations : (m, 3, 3) array
     cam2_in_cam1_translations : (m, 3) array
-        Camera 2's centre in camera 1's frame, metric.
+        Camera 2's centre in camera 1's frame, of known length.
     initial_rotations : (n, 3, 3) array
-        cam_from_world.
+        cam_from_world rotations.
     initial_centers : (n, 3) array
+        Projection centres, world frame.
     rotation_weights, translation_weights : (m,) array, optional
         kappa and tau of :class:`~colmap_vg.pose_graph.costs.ChordalCost`, default 1.
     information : (m, 6, 6) array, optional
-        Of rotation vector (camera 2's frame) and translation (camera 1's frame), in this order; then the cost is
-        :class:`~colmap_vg.pose_graph.costs.InformationCost`, and the two kinds of weights multiply its two blocks.
+        Information matrix of rotation vector (camera 2's frame) and translation (camera 1's frame), in this order. The
+        cost is then :class:`~colmap_vg.pose_graph.costs.InformationCost`, and the two weights multiply its two blocks.
     max_num_iterations : int
     tolerance : float
-        On :attr:`PoseGraphResult.gradient`.
+        Value of :attr:`PoseGraphResult.gradient` at which the iteration ends.
 
     Returns
     -------
     PoseGraphResult
-        The first camera keeps its pose, up to damping.
+        The first camera keeps its pose, up to the effect of damping.
 
     Raises
     ------

@@ -1,11 +1,11 @@
-"""BATA: ``min sum w rho(||s (p_j - p_i) - gamma||^2)`` over positions and ``s >= 0``, angle-based and robust.
+"""BATA, robust angle-based translation averaging: ``min sum w rho(||s (p_j - p_i) - gamma||^2)``, ``s >= 0``.
 
-Zhuang, Cheong & Lee, "Baseline Desensitizing in Translation Averaging", CVPR 2018, in their bilinear form: s, one for
-each edge, stands for the inverse of its length, so that long baselines weigh no more than short ones. With the best
+Zhuang, Cheong & Lee, "Baseline Desensitizing in Translation Averaging", CVPR 2018, in their bilinear form. The scale s
+of each edge is its inverse length, so that long baselines have no more weight than short ones. With the optimal
 ``s = max(gamma . d, 0) / ||d||²``, ``d = p_j - p_i``, the residual is the sine of the angle up to 90 degrees and 1
-beyond. As published: a few reweightings of the unsquared distance across the directions (their revised LUD, the
-objective of ShapeFit) give the start; then outer iterations set the weights of rho at the last positions, and inner
-ones alternate between s and positions, both in closed form. The gauge is ``sum p = 0`` and
+beyond. As published, initial positions come from a few reweighting iterations on the unsquared distance perpendicular
+to the directions (their revised LUD, the objective of ShapeFit). Outer iterations then update the weights of rho, and
+inner iterations alternate between s and positions, both in closed form. The gauge is ``sum p = 0`` and
 ``sum gamma . (p_j - p_i) = m``.
 """
 
@@ -23,11 +23,13 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 ROBUST_SCALE = 0.1
-"""Of the Cauchy loss, a sine: 5.7 degrees; the paper's threshold."""
+"""Scale of the Cauchy loss, a sine: 5.7 degrees; the paper's threshold."""
 START_ITERATIONS = 10
+"""Iterations of ShapeFit for the initial positions."""
 NUM_INNER = 10
+"""Inner iterations per outer iteration."""
 MIN_RELATIVE_LENGTH = 1e-8
-"""Edges shorter than this share of the spread count as this long: s stays finite."""
+"""Lower limit of edge lengths as a share of the root mean square distance from the centroid: s stays finite."""
 
 
 def solve_bata(
@@ -40,7 +42,7 @@ def solve_bata(
     max_num_iterations: int = 500,
     tolerance: float = 1e-8,
 ) -> PositionResult:
-    """Positions of least robust angular residuals.
+    """Solve for positions that minimise robust angular residuals.
 
     Parameters
     ----------
@@ -52,11 +54,11 @@ def solve_bata(
     weights : (m,) array, optional
         Multipliers of the robust losses, default 1.
     initial_centers : (n, 3) array, optional
-        In place of the published start.
+        Initial positions. Default: those of the paper.
     max_num_iterations : int
-        Outer iterations. The paper stops after 10.
+        Maximum number of outer iterations. The paper stops after 10.
     tolerance : float
-        On the relative change of positions that an outer iteration makes.
+        Relative change of positions in an outer iteration below which the iteration ends.
 
     Returns
     -------
@@ -101,14 +103,14 @@ def solve_bata(
 
 
 class _Bata:
-    """The two closed-form steps."""
+    """Closed-form updates of scales and positions."""
 
     def __init__(self, num_images: int, edges: IntArray, directions: Array) -> None:
         self._i, self._j, self._gamma = edges[:, 0], edges[:, 1], directions
         self._system = LaplacianSystem(num_images, edges)
 
     def gauged(self, p: Array) -> Array:
-        """Centroid 0 and mean length along the directions 1; where they contradict, RMS length 1."""
+        """Positions with centroid 0 and mean length 1 along the directions, or RMS length 1 if it is not positive."""
         p = centered(p)
         d = p[self._j] - p[self._i]
         along = float(np.einsum("ka,ka->", self._gamma, d))
@@ -126,6 +128,6 @@ class _Bata:
         return np.asarray(np.linalg.norm(scales[:, None] * (p[self._j] - p[self._i]) - self._gamma, axis=1))
 
     def positions(self, weights: Array, scales: Array) -> Array:
-        """Least squares at fixed s. Positions and s are free in scale together, so the gauge is set afterwards."""
+        """Least-squares positions at fixed s, in the gauge: positions and s have a common free scale."""
         factor = self._system.factor(weights * scales**2)
         return self.gauged(factor.solve(self._system.right_side(weights * scales, self._gamma)))

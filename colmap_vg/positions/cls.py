@@ -1,9 +1,9 @@
 """Constrained least squares (CLS): ``min sum w ||lambda gamma - (p_j - p_i)||^2`` with ``lambda >= 1``.
 
-Tron & Vidal's formulation; eq. CLE2 of Nasiri et al. With ``a = gamma . (p_j - p_i)`` the best ``lambda`` is
-``max(a, 1)``. Put in, the cost is convex, continuously differentiable and piecewise quadratic in the positions: its
-Hessian block is ``I - gamma gamma^T`` where ``a >= 1`` and ``I`` where ``a < 1``. A semismooth Newton method with an
-exact piecewise line search ends in a handful of sparse solves; no QP solver is needed.
+Tron & Vidal's formulation; eq. CLE2 of Nasiri et al. With ``a = gamma . (p_j - p_i)`` the optimal ``lambda`` is
+``max(a, 1)``. After substitution the cost is convex, continuously differentiable and piecewise quadratic in the
+positions: its Hessian block is ``I - gamma gamma^T`` where ``a >= 1`` and ``I`` where ``a < 1``. A semismooth Newton
+method with an exact piecewise line search converges in a few sparse solves; no QP solver is needed.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 DAMPING = 1e-9
-"""Share of the mean diagonal added to the Hessian; it fixes the translation and whatever rigidity leaves free."""
+"""Share of the mean diagonal added to the Hessian; it fixes the translation and non-rigid motions."""
 
 
 def solve_cls(
@@ -31,7 +31,7 @@ def solve_cls(
     max_num_iterations: int = 100,
     tolerance: float = 1e-12,
 ) -> PositionResult:
-    """Minimise the CLS cost to its exact minimum.
+    """Solve for positions at the exact minimum of the CLS cost.
 
     Parameters
     ----------
@@ -44,14 +44,15 @@ def solve_cls(
     weights : (m,) array, optional
         Multipliers of the squared residuals, default 1.
     initial_centers : (n, 3) array, optional
+        Default: the positions of least cost with all ``lambda = 1``.
     max_num_iterations : int
     tolerance : float
-        On the largest gradient entry, relative to the largest weighted degree.
+        Largest gradient entry at convergence, relative to the largest weighted degree.
 
     Returns
     -------
     PositionResult
-        `lambdas` are ``max(gamma . (p_j - p_i), 1)``: a share of them stays at exactly 1.
+        `lambdas` are ``max(gamma . (p_j - p_i), 1)``: some of them are exactly 1.
 
     Raises
     ------
@@ -93,7 +94,7 @@ def solve_cls(
 
 
 def _unit_length_start(num_images: int, edges: IntArray, gamma: Array, w: Array) -> Array:
-    """Positions for ``lambda = 1`` everywhere: one scalar Laplacian for the three axes."""
+    """Least-squares positions with all ``lambda = 1``: one scalar Laplacian for the three axes."""
     pattern = BlockPattern(num_images, edges, 1)
     block = w[:, None, None]
     damping = np.full((num_images, 1, 1), DAMPING * w.sum() / num_images)
@@ -104,14 +105,14 @@ def _unit_length_start(num_images: int, edges: IntArray, gamma: Array, w: Array)
 
 
 def _exact_step(w: Array, gamma: Array, d: Array, s: Array) -> float:
-    """Step that minimises the piecewise-quadratic cost along a line, exactly.
+    """Step length that exactly minimises the piecewise quadratic cost along a line.
 
-    Along ``d + alpha s`` the slope is ``2 sum w (s . (d + alpha s) - lambda(alpha) gamma . s)``: piecewise linear and
-    rising. Sorted by where ``gamma . (d + alpha s)`` crosses 1, its zero is found by cumulative sums.
+    Along ``d + alpha s`` the slope is ``2 sum w (s . (d + alpha s) - lambda(alpha) gamma . s)``, piecewise linear and
+    increasing. Its zero is found by cumulative sums over the breakpoints where ``gamma . (d + alpha s) = 1``.
     """
     a, b = np.einsum("ka,ka->k", gamma, d), np.einsum("ka,ka->k", gamma, s)
     offset, slope = float(np.sum(w * np.einsum("ka,ka->k", d, s))), float(np.sum(w * np.einsum("ka,ka->k", s, s)))
-    # lambda gamma . s is (a + alpha b) b where a + alpha b >= 1, and b elsewhere. Start at alpha = 0.
+    # lambda gamma . s is (a + alpha b) b where a + alpha b >= 1, and b elsewhere. First at alpha = 0.
     above = (a > 1.0) | ((a == 1.0) & (b >= 0.0))
     offset -= float(np.sum(w * np.where(above, a, 1.0) * b))
     slope -= float(np.sum(w * np.where(above, b, 0.0) * b))

@@ -1,9 +1,10 @@
 """Cross: ``min sum w ||gamma x (p_j - p_i)||^2 / ||p_j - p_i||^2``, by iteratively reweighted least squares.
 
-Govindu, CVPR 2001. Each direction asks for ``gamma x (p_j - p_i) = 0``, linear in the positions, so that least squares
-with ``sum ||p||^2 = 1`` is an eigenvector. Its residuals grow with the length of an edge; the weights
-``1 / ||p_j - p_i||^2`` of the last positions turn them into sines of angles. Nothing guarantees that this converges,
-and a sine does not tell a direction from its opposite (the fault of the orthogonal metric, Fig. 4 of Nasiri et al.).
+Govindu, CVPR 2001. Each direction gives an equation ``gamma x (p_j - p_i) = 0``, linear in the positions, so that the
+least-squares solution with ``sum ||p||^2 = 1`` is an eigenvector. Residuals are proportional to the edge lengths;
+weights ``1 / ||p_j - p_i||^2`` from the previous positions turn them into sines of angles. Convergence is not
+guaranteed, and a sine does not distinguish opposite directions (the fault of the orthogonal metric, Fig. 4 of Nasiri et
+al.).
 """
 
 import numpy as np
@@ -19,15 +20,17 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 DAMPING = 1e-10
-"""Share of the mean diagonal added before factoring: the matrix is singular along translations."""
+"""Share of the mean diagonal added before factorisation, since the matrix is singular along translations."""
 MIN_RELATIVE_LENGTH = 1e-3
-"""Edges shorter than this share of the median count as this long, so that no weight swamps the rest."""
+"""Lower limit of edge lengths in the weights, as a share of the median, so that no weight dominates the others."""
 NUM_VECTORS = 4
-"""Vectors iterated together: the error shrinks by the ratio of the first eigenvalue to the fifth."""
+"""Number of vectors iterated together: the error decreases by the ratio of the first eigenvalue to the fifth."""
 MAX_SOLVES = 50
+"""Maximum number of inverse iterations."""
 EIGENVECTOR_TOLERANCE = 1e-11
+"""Change of the unit eigenvector below which the iteration ends."""
 ROUNDING_BELOW = 1e-7
-"""Changes below this that no longer halve are rounding: very unequal weights leave no more digits."""
+"""Changes below this that no longer halve are due to rounding, which very unequal weights amplify."""
 
 
 def solve_cross(
@@ -39,7 +42,7 @@ def solve_cross(
     max_num_iterations: int = 100,
     tolerance: float = 1e-8,
 ) -> PositionResult:
-    """Positions whose differences are as parallel to the directions as possible.
+    """Solve for positions that minimise the squared sines of the angles to the directions.
 
     Parameters
     ----------
@@ -52,15 +55,15 @@ def solve_cross(
     weights : (m,) array, optional
         Multipliers of the squared residuals, default 1.
     max_num_iterations : int
-        Reweightings.
+        Maximum number of reweighting iterations.
     tolerance : float
-        On the relative change of positions.
+        Relative change of positions below which the iteration ends.
 
     Returns
     -------
     PositionResult
-        ``sum ||p||^2 = 1``; the sign is that by which most of the weight of edges points forward. `lambdas` are the
-        lengths ``||p_j - p_i||``. Where the reweighting does not converge, the positions of least cost on its way.
+        ``sum ||p||^2 = 1``; the sign is chosen so that most edge weight points forward. `lambdas` are the lengths
+        ``||p_j - p_i||``. Without convergence these are the iterate of least cost.
 
     Raises
     ------
@@ -106,7 +109,7 @@ def solve_cross(
 
 
 def sine_cost(p: Array, edges: IntArray, directions: Array, w: Array) -> float:
-    """``sum w ||gamma x d̂||^2``, eq. CLE1 with the orthogonal metric; an edge of no length costs all of its weight."""
+    """``sum w ||gamma x d̂||^2``, eq. CLE1 with the orthogonal metric; an edge of length zero costs its whole weight."""
     d = p[edges[:, 1]] - p[edges[:, 0]]
     squared = np.einsum("ka,ka->k", d, d)
     crossed = np.sum(np.cross(directions, d) ** 2, axis=1)
@@ -114,10 +117,11 @@ def sine_cost(p: Array, edges: IntArray, directions: Array, w: Array) -> float:
 
 
 class _SmallestVector:
-    """Centred unit vectors (n, 3) of least ``sum (p_j - p_i)^T H (p_j - p_i)``, each search begun from the last.
+    """Centred unit vector (n, 3) that minimises ``sum (p_j - p_i)^T H (p_j - p_i)``, warm-started from the last one.
 
-    Inverse iteration on a few vectors at once, with Rayleigh-Ritz: between reweightings the vectors change little, so
-    that a few solves do. The matrix and its inverse keep centred vectors centred, so translations never enter.
+    Inverse iteration on a few vectors at once, with Rayleigh-Ritz: the vectors change little between reweightings, so
+    that a few solves suffice. The matrix and its inverse map centred vectors to centred ones, which excludes
+    translations.
     """
 
     def __init__(self, num_images: int, edges: IntArray) -> None:

@@ -1,15 +1,16 @@
 """Direct minimisation of eq. CLE1: ``min sum w d^2(gamma, d̂)`` over positions, d̂ the unit vector of ``p_j - p_i``.
 
-Nasiri et al. iterate towards it (Alg. 1O, and the appendix for the orthogonal metric); 1O's fixed point is not quite
-its minimum. Here Levenberg-Marquardt steps with sparse factors go down the cost itself, Newton's near the end. With
-``c = gamma . d̂``, ``q = gamma - c d̂`` and l the length, by d:
+Nasiri et al. approach it by fixed-point iterations (Alg. 1O, and the appendix for the orthogonal metric); the fixed
+point of 1O is not exactly its minimum. Here the cost itself is minimised by sparse Levenberg-Marquardt steps, and by
+Newton steps near convergence. With ``c = gamma . d̂``, ``q = gamma - c d̂`` and the length l, derivatives by d are:
 
 * chordal, ``||gamma - d̂||² = 2 - 2 c``: gradient ``-2 q / l``, Gauss-Newton Hessian ``2 (I - d̂ d̂ᵀ) / l²``;
 * orthogonal, ``||gamma x d̂||² = 1 - c²``: gradient ``-2 c q / l``, Hessian ``2 (I - d̂ d̂ᵀ - q qᵀ) / l²``.
 
-Neither sees a translation or a scale: the centroid goes to 0, the spread back to that of the start. The lowest cost is
-not always the best answer: where short, noisy pairs mix with long ones, drawing whole groups of cameras together can
-cost less than the truth (seen on 606 simulated cameras, 20 degrees on the shortest pairs). Alg. 1 stays nearer to CLS.
+Both are invariant to translation and scale: the centroid is set to 0 and the spread to its initial value. The lowest
+cost is not always the best solution: with short, noisy pairs among long ones, collapsing whole groups of cameras can
+cost less than the true positions (seen on 606 simulated cameras with 20 degrees of noise on the shortest pairs). Alg. 1
+stays closer to CLS.
 """
 
 from dataclasses import dataclass
@@ -29,17 +30,18 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Metric = Literal["chordal", "orthogonal"]
 
-MIN_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-10, 1.0, 1e8
-"""Shares of each camera's mean curvature. The first is large, to keep to the start's valley."""
+MIN_DAMPING, INITIAL_DAMPING, MAX_DAMPING = 1e-10, 1.0, 1e8
+"""Damping as shares of each camera's mean curvature. A large initial value keeps the iteration in the basin of the
+initial positions."""
 NEWTON_BELOW = 1e-2
-"""Size of the gradient from which on the exact Hessian is tried."""
+"""Size of the gradient, dimensionless, below which the exact Hessian is tried."""
 COST_ROUNDING = 1e-13
-"""Differences of costs below this share of all weights are rounding; then the gradient decides."""
+"""Cost differences below this share of the total weight are due to rounding; then the gradient decides."""
 STALL_STEPS, STALL_SHARE = 10, 1e-8
-"""The cost counts as minimal when so many steps lower it by no more than this share. Outliers can draw two cameras
-into one, where the cost has a lower end that it never reaches and a gradient that does not vanish."""
+"""The cost has converged if this number of steps lowers it by at most this share. Outliers can make two cameras
+coincide, where the cost has an infimum that it never attains and a gradient that does not vanish."""
 START_ITERATIONS, START_TOLERANCE = 100, 1e-3
-"""Of Alg. 1C, which takes CLS's reversed and shrunken edges near their minimum."""
+"""Limits of Alg. 1C, which corrects the reversed and shortened edges of CLS before the minimisation."""
 
 
 def solve_cle1(
@@ -51,7 +53,7 @@ def solve_cle1(
     max_num_iterations: int = 200,
     tolerance: float = 1e-9,
 ) -> PositionResult:
-    """Minimise the chordal distance of directions, from CLS and a few turns of Alg. 1C.
+    """Solve for positions that minimise the chordal distance of directions, initialised by CLS and Alg. 1C.
 
     Parameters
     ----------
@@ -107,7 +109,7 @@ def minimize_directions(
     max_num_iterations: int = 200,
     tolerance: float = 1e-9,
 ) -> PositionResult:
-    """A local minimum of eq. CLE1 from given positions.
+    """Find a local minimum of eq. CLE1 from given positions.
 
     Parameters
     ----------
@@ -123,9 +125,9 @@ def minimize_directions(
         Multipliers of the squared residuals, default 1.
     metric : "chordal" or "orthogonal"
     max_num_iterations : int
-        Accepted steps.
+        Maximum number of accepted steps.
     tolerance : float
-        On the gradient, each camera's in the unit that its curvature sets: ``sqrt(g^T D^-1 g / sum w)``.
+        Size of the gradient g at convergence, ``sqrt(g^T D^-1 g / sum w)`` with the curvature D of each camera.
 
     Returns
     -------
@@ -141,7 +143,7 @@ def minimize_directions(
     problem = _Directions(num_images, edges, directions_world, unit_weights(weights, len(edges)), metric)
     p = centered(initial_centers)
     size = spread(p)
-    cost, damping = problem.cost(p), FIRST_DAMPING
+    cost, damping = problem.cost(p), INITIAL_DAMPING
     at = problem.linearize(p)
     log, stalled = [LogEntry("cle1", 0, cost, at.size)], False
     while at.size > tolerance and len(log) <= max_num_iterations:
@@ -171,7 +173,7 @@ def minimize_directions(
 
 @dataclass(frozen=True, eq=False)
 class _Linearization:
-    """Gradient (n, 3), blocks (m, 3, 3) of Gauss-Newton's and the exact Hessian, mean curvatures (n,), size."""
+    """Gradient (n, 3), its size, blocks (m, 3, 3) of the Gauss-Newton and exact Hessian, and mean curvatures (n,)."""
 
     gradient: Array
     gauss_newton: Array
@@ -210,7 +212,7 @@ class _Directions:
         return _Linearization(gradient, gauss_newton, exact, curvature, float(size))
 
     def step(self, at: _Linearization, damping: float, *, exact: bool) -> Array | None:
-        """Newton's step where `exact`, else Levenberg-Marquardt's; None where it does not lead down."""
+        """Newton step if `exact`, else Levenberg-Marquardt step; None if it is not a descent direction."""
         level = (damping + MIN_DAMPING) * at.curvature[:, None, None] * np.eye(3)
         H = at.exact if exact else at.gauss_newton
         try:
@@ -225,7 +227,7 @@ class _Directions:
         return d / length[:, None], length
 
     def _blocks(self, u: Array, c: Array, q: Array) -> tuple[Array, Array]:
-        """Half the Hessian of an edge's cost by d, times its squared length: Gauss-Newton's and exact."""
+        """Half the Gauss-Newton and exact Hessians of each edge's cost by d, times its squared length."""
         across = np.eye(3) - u[:, :, None] * u[:, None, :]
         mixed = q[:, :, None] * u[:, None, :]
         mixed = mixed + np.swapaxes(mixed, 1, 2)
@@ -233,7 +235,7 @@ class _Directions:
         if self._chordal:
             # -c has gradient -q / l and Hessian (c (I - u u^T) + q u^T + u q^T) / l^2.
             return across, C * across + mixed
-        # -c^2 / 2 has gradient -c q / l; the outer product of c's gradient comes in.
+        # -c^2 / 2 has gradient -c q / l; its Hessian has the outer product of the gradient of c in addition.
         outer = q[:, :, None] * q[:, None, :]
-        # gamma x u moves by gamma x (I - u u^T) dd / l; its square is across - (across gamma) (across gamma)^T.
+        # gamma x u changes by gamma x (I - u u^T) dd / l; the square is across - (across gamma) (across gamma)^T.
         return across - outer, C * C * across + C * mixed - outer

@@ -1,17 +1,17 @@
-"""Algorithm 1 of Nasiri et al.: positions by repeated least squares with the scale factors of the last positions.
+"""Algorithm 1 of Nasiri et al.: positions by iterated least squares with scale factors from the previous positions.
 
 * **1C**, displacement error: ``lambda = ||p_j - p_i||``, then LS1, ``min_p sum w ||lambda gamma - (p_j - p_i)||^2``.
   Its matrix is one scalar Laplacian, factored once for all iterations and axes.
 * **1O**, direction error: ``lambda = 1 / ||p_j - p_i||``, then LS2, ``min_p sum w ||gamma - lambda (p_j - p_i)||^2``
-  (eq. Crs3), a Laplacian with weights ``w lambda^2``, factored in each iteration. The weights have a bound, so that
-  cameras do not fall into one point.
+  (eq. Crs3), a Laplacian with weights ``w lambda^2``, factored in each iteration. The weights are bounded, so that
+  cameras do not collapse.
 
-After each iteration the centroid goes to 0 and ``sum ||p||^2`` back to what the start had; nothing else keeps 1C from
-shrinking. Cameras stay within the reach of the start (:func:`farthest_allowed`): one whose few directions all but
-agree, as at a leaf of a noisy graph, would go to infinity, and the gauge would draw the others into one point. Where
-none is held so, the fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C
-``sum_j (c d - ||d|| gamma) = 0``, with ``d = p_j - p_i`` and c the multiplier of the gauge. Anderson acceleration
-reaches the same point sooner.
+After each iteration the centroid is set to 0 and ``sum ||p||^2`` to its initial value; nothing else keeps 1C from
+shrinking. Cameras are kept within a distance from the centroid (:func:`farthest_allowed`): one with few, nearly
+parallel directions, such as a leaf of a noisy graph, would diverge, and the gauge would collapse the others. If no
+camera reaches that distance, the fixed point of 1O satisfies ``sum_j (c d̂ - gamma) / ||d|| = 0``, that of 1C
+``sum_j (c d - ||d|| gamma) = 0``, with ``d = p_j - p_i`` and the multiplier c of the gauge. Anderson acceleration
+reaches the same fixed point in fewer iterations.
 """
 
 from typing import Literal
@@ -29,13 +29,13 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MIN_RELATIVE_LENGTH = 1e-8
-"""Edges shorter than this share of the spread count as this long: direction weights stay finite."""
+"""Lower limit of edge lengths as a share of the root mean square distance from the centroid: weights stay finite."""
 MIN_WEIGHTED_LENGTH = 0.1
-"""Edges shorter than this share of the start's median edge weigh as if they were this long in 1O and 2O. Their own
-weight, one over the squared length, would draw cameras with contradicting edges into one point, ever faster."""
-REACH_QUANTILE, LEAST_REACH = 0.95, 1.5
-"""Common reach of the cameras: what this share of them keeps at the start, and at least so many root mean square
-distances. A start that stands farther out may stay."""
+"""Lower limit of edge lengths in the weights of 1O and 2O, as a share of the initial median edge length. Unbounded
+weights, one over the squared length, would collapse cameras with inconsistent edges at an increasing rate."""
+REACH_QUANTILE, MIN_REACH = 0.95, 1.5
+"""Largest distance of cameras from the centroid: this quantile of the initial distances, and at least this multiple of
+their root mean square. Cameras that are initially farther away may keep their distance."""
 
 
 def solve_fixed_point(
@@ -50,7 +50,7 @@ def solve_fixed_point(
     max_num_iterations: int = 1000,
     tolerance: float = 1e-10,
 ) -> PositionResult:
-    """Alg. 1C or 1O from given positions, usually those of CLS.
+    """Solve for positions by Alg. 1C or 1O from initial positions, usually those of CLS.
 
     Parameters
     ----------
@@ -61,12 +61,14 @@ def solve_fixed_point(
     initial_centers : (n, 3) array
         Their spread ``sum ||p||^2`` about the centroid is kept.
     approach : "C" or "O"
+        Displacement or direction error.
     weights : (m,) array, optional
         Multipliers of the squared residuals, default 1 (the paper).
     accelerate : bool
+        Whether to use Anderson acceleration.
     max_num_iterations : int
     tolerance : float
-        On the relative change of positions that one plain iteration makes.
+        Relative change of positions in one plain iteration below which the iteration ends.
 
     Returns
     -------
@@ -112,7 +114,7 @@ def solve_fixed_point(
 
 
 class LaplacianSystem:
-    """Weighted Laplacians of one graph on a fixed pattern."""
+    """Weighted Laplacian systems of one graph with a fixed sparsity pattern."""
 
     def __init__(self, num_images: int, edges: IntArray) -> None:
         self._num_images, self._edges = num_images, edges
@@ -120,7 +122,7 @@ class LaplacianSystem:
 
     def factor(self, weights: Array) -> Factor:
         block = weights[:, None, None]
-        # The mean is free: a damping far below the rounding of the answer makes the matrix definite.
+        # The mean is free: damping far below the rounding of the result makes the matrix definite.
         damping = np.full((self._num_images, 1, 1), 1e-12 * weights.sum() / self._num_images)
         return factorize(self._pattern.assemble(block, block, -block, damping))
 
@@ -131,19 +133,19 @@ class LaplacianSystem:
 
 
 def shortest_weighted_length(start: Array, edges: IntArray) -> float:
-    """Length below which edges weigh no more; the gauge keeps the scale, so that the start's edges tell it."""
+    """Edge length below which weights no longer increase, from initial positions whose scale the gauge preserves."""
     return MIN_WEIGHTED_LENGTH * float(np.median(np.linalg.norm(start[edges[:, 1]] - start[edges[:, 0]], axis=1)))
 
 
 def farthest_allowed(start: Array) -> Array:
-    """Distance from the centroid that each camera may reach, (n,), from positions with centroid 0."""
+    """Largest allowed distance of each camera from the centroid, (n,), from initial positions with centroid 0."""
     distance = np.linalg.norm(start, axis=1)
     rms = float(np.sqrt(np.mean(distance**2)))
-    return np.asarray(np.maximum(distance, max(float(np.quantile(distance, REACH_QUANTILE)), LEAST_REACH * rms)))
+    return np.asarray(np.maximum(distance, max(float(np.quantile(distance, REACH_QUANTILE)), MIN_REACH * rms)))
 
 
 def regauged(p: Array, size: float, reach: Array) -> Array:
-    """Positions with centroid 0 and spread `size`, after those beyond their reach were drawn back to it."""
+    """Positions with centroid 0 and spread `size`, after limiting their distances from the centroid to `reach`."""
     p = centered(p)
     p = p * (size / spread(p))
     distance = np.linalg.norm(p, axis=1)
@@ -154,6 +156,7 @@ def regauged(p: Array, size: float, reach: Array) -> Array:
 
 
 def edge_lengths(p: Array, edges: IntArray, size: float) -> Array:
+    """Edge lengths (m,), bounded below by a small share of the root mean square distance from the centroid."""
     shortest = MIN_RELATIVE_LENGTH * size / np.sqrt(len(p))
     return np.asarray(np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest))
 

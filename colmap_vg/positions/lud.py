@@ -1,7 +1,7 @@
 """Least unsquared deviations (LUD): ``min sum w ||lambda gamma - (p_j - p_i)||`` with ``lambda >= 1``.
 
-Ozyesil & Singer, CVPR 2015. Convex, so no minority of outliers can fold it; solved by iteratively reweighted CLS, each
-started from the last.
+Ozyesil & Singer, CVPR 2015. The problem is convex, so a minority of outliers cannot fold the solution. It is solved by
+iteratively reweighted CLS with warm starts.
 """
 
 import numpy as np
@@ -15,9 +15,10 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 RESIDUAL_FLOOR = 1e-3
-"""Residuals below this (in the unit of the shortest lambda) weigh as least squares."""
+"""Lower limit of residuals in the weights, in the unit of the least lambda, 1."""
 ROUGH_TOLERANCE, FINAL_TOLERANCE = 1e-6, 1e-12
-"""Of CLS while the weights still change, and of the last reweightings: what is left of exact data is rounding."""
+"""Tolerance of CLS while the weights change, and in the last reweighting iterations, where exact data are solved to
+rounding."""
 
 
 def solve_lud(
@@ -29,7 +30,7 @@ def solve_lud(
     max_num_iterations: int = 100,
     tolerance: float = 1e-6,
 ) -> PositionResult:
-    """Positions of least unsquared displacement error.
+    """Solve for positions that minimise the unsquared displacement error.
 
     Parameters
     ----------
@@ -41,9 +42,9 @@ def solve_lud(
     weights : (m,) array, optional
         Multipliers of the (unsquared) residuals, default 1.
     max_num_iterations : int
-        Reweightings.
+        Maximum number of reweighting iterations.
     tolerance : float
-        On the relative change of positions.
+        Relative change of positions below which the iteration ends.
 
     Returns
     -------

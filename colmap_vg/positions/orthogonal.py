@@ -1,10 +1,10 @@
-"""Block coordinate descent for the orthogonal metric: ``min sum w ||gamma - lambda (p_j - p_i)||^2``, lambda free.
+"""Block coordinate descent for the orthogonal metric: ``min sum w ||gamma - lambda (p_j - p_i)||^2`` over p and lambda.
 
-The appendix of Nasiri et al. (eq. Crs3). With ``d = p_j - p_i`` and the best ``lambda = gamma . d / ||d||^2``, an
-edge's cost is ``||gamma x d̂||^2``, so the minimum is that of eq. CLE1 with the orthogonal metric, and no constraint
-is needed. Two closed-form steps alternate: positions at fixed lambda (a scalar Laplacian with weights ``w
-lambda^2``), lambda at fixed positions. The cost never rises. A negative lambda is an edge that points backwards,
-which this metric allows.
+The appendix of Nasiri et al. (eq. Crs3). With ``d = p_j - p_i`` and the optimal ``lambda = gamma . d / ||d||^2``, the
+cost of an edge is ``||gamma x d̂||^2``, so the minimum is that of eq. CLE1 with the orthogonal metric, and no constraint
+is needed. Two closed-form updates alternate: positions at fixed lambda (a scalar Laplacian with weights
+``w lambda^2``), and lambda at fixed positions. The cost never increases. A negative lambda means that the edge points
+backwards, which this metric allows.
 """
 
 import numpy as np
@@ -21,9 +21,9 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MIN_RELATIVE_LENGTH = 1e-8
-"""Edges shorter than this share of the spread count as this long: lambda stays finite."""
+"""Lower limit of edge lengths as a share of the root mean square distance from the centroid: lambda stays finite."""
 COST_ROUNDING = 1e-11
-"""Relative differences of costs below this are rounding."""
+"""Relative differences of costs below this are due to rounding."""
 
 
 def solve_orthogonal(
@@ -37,7 +37,7 @@ def solve_orthogonal(
     max_num_iterations: int = 2000,
     tolerance: float = 1e-8,
 ) -> PositionResult:
-    """Minimise the orthogonal distance between directions by the paper's coordinate descent.
+    """Solve for positions that minimise the orthogonal distance of directions, by coordinate descent.
 
     Parameters
     ----------
@@ -50,18 +50,18 @@ def solve_orthogonal(
     weights : (m,) array, optional
         Multipliers of the squared residuals, default 1.
     initial_centers : (n, 3) array, optional
-        Default those of CLS; the paper names no start.
+        Default: those of CLS; the paper does not specify them.
     accelerate : bool
-        Anderson acceleration; its points are only taken where they cost no more than the plain descent's.
+        Whether to use Anderson acceleration; its points are accepted only if they do not increase the cost.
     max_num_iterations : int
     tolerance : float
-        On the relative change of positions that one plain iteration makes.
+        Relative change of positions in one plain iteration below which the iteration ends.
 
     Returns
     -------
     PositionResult
-        `lambdas` are eq. Crs3's, about ``1 / ||p_j - p_i||``; `cost` is eq. CLE1 with the orthogonal metric. The
-        spread is that of the start: the cost does not depend on it.
+        `lambdas` are those of eq. Crs3, about ``1 / ||p_j - p_i||``; `cost` is eq. CLE1 with the orthogonal metric. The
+        spread is that of the initial positions: the cost does not depend on it.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def solve_orthogonal(
     last: list[Array] = [start]
 
     def descend(p: Array) -> Array:
-        # A guess of the acceleration that climbs is put back to the last point of the descent.
+        # If the accelerated point increases the cost, return to the last point of the descent.
         if sine_cost(p, edges, gamma, w) > (1.0 + COST_ROUNDING) * sine_cost(last[0], edges, gamma, w):
             p = last[0]
         scales = best_scales(p, edges, gamma, size)
@@ -102,7 +102,7 @@ def solve_orthogonal(
 
 
 def best_scales(p: Array, edges: IntArray, directions: Array, size: float) -> Array:
-    """``lambda = gamma . d / ||d||^2``, which brings ``lambda d`` nearest to gamma: (m,)."""
+    """Optimal ``lambda = gamma . d / ||d||^2``, for which ``lambda d`` is closest to gamma: (m,)."""
     d = p[edges[:, 1]] - p[edges[:, 0]]
     shortest = MIN_RELATIVE_LENGTH * size / np.sqrt(len(p))
     return np.asarray(np.einsum("ka,ka->k", directions, d) / np.maximum(np.einsum("ka,ka->k", d, d), shortest**2))

@@ -1,4 +1,4 @@
-"""What every position solver returns."""
+"""Result type and input checks shared by all position solvers."""
 
 from dataclasses import dataclass
 
@@ -15,19 +15,20 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class PositionResult:
-    """Positions at known rotations.
+    """Positions solved at known rotations, with convergence information.
 
     Attributes
     ----------
     projection_centers : (n, 3) array
-        Centroid 0; scale as the solver leaves it.
+        World frame, centroid 0; the scale depends on the solver.
     lambdas : (m,) array
-        The scale factor that the solver gives each edge; its length where the solver has none.
+        Scale factor of each edge as defined by the solver; its length if the solver has none.
     cost : float
-        The solver's own objective.
+        Objective of the solver.
     num_iterations : int
     converged : bool
     log : tuple of LogEntry
+        One entry per iteration.
     """
 
     projection_centers: Array
@@ -39,23 +40,24 @@ class PositionResult:
 
 
 def check_connected(num_images: int, edges: IntArray) -> None:
-    """Refuse graphs in which some image is not linked to the others.
+    """Check that the graph is connected.
 
     Raises
     ------
     GraphError
+        Some image is not connected to the others.
     """
     component = components_by_size(num_images, edges)
     if num_images and component.max() > 0:
         row = int(np.flatnonzero(component)[0])
         raise GraphError(
-            f"positions need a connected graph: image row {row} is not linked to the"
-            f" {int((component == 0).sum())} images of the largest component; solve the components one by one"
+            f"positions need a connected graph: image row {row} is not connected to the"
+            f" {int((component == 0).sum())} images of the largest component; solve each component separately"
         )
 
 
 def unit_weights(weights: Array | None, num_edges: int) -> Array:
-    """Weights, 1 for each edge when none are given."""
+    """Weights (m,) as floats; all one if None."""
     return np.ones(num_edges) if weights is None else np.asarray(weights, dtype=float)
 
 

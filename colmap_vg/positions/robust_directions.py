@@ -1,13 +1,13 @@
-"""Positions at the minimum of a robust direction error, and how well the directions fix each of them.
+"""Positions that minimise a robust direction error, with the standard deviation of each position.
 
-The error is that of Alg. 1O (eq. CLE1 of Nasiri et al.), ``r = gamma - b / ||b||`` with ``b = p_j - p_i``, under a
-Cauchy loss whose scale follows the residuals. Edges shorter than a small share of the start's median are divided by
-that length in place of their own: without it, drawing cameras together, or one camera away so that the gauge draws the
-others together, makes contradictions vanish. Levenberg-Marquardt steps go down that cost; then once more with weights
-from the noise that edges of each length turned out to have, for a direction is worth the more the longer its baseline.
+The residual is that of Alg. 1O (eq. CLE1 of Nasiri et al.), ``r = gamma - b / ||b||`` with ``b = p_j - p_i``, under a
+Cauchy loss whose scale follows the residuals. Edges shorter than a small share of the initial median length are divided
+by that length instead of their own: otherwise inconsistent edges would be explained by collapsing cameras, or by moving
+one camera away so that the gauge collapses the others. Levenberg-Marquardt minimises the cost twice, the second time
+with weights from the noise estimated per edge length, since directions over longer baselines are more accurate.
 
-Iterating LS2 instead takes hundreds of turns where groups of cameras are linked loosely (eight in ten cameras within
-5 % of the truth after sixty turns on 336 simulated ones, where the minimum has 99 %).
+Iterating LS2 instead takes hundreds of iterations if groups of cameras are weakly connected (on 336 simulated cameras,
+80 % were within 5 % of the truth after sixty iterations, 99 % at the minimum).
 """
 
 from dataclasses import dataclass
@@ -25,31 +25,34 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MIN_LENGTH = 1e-2
-"""Edges shorter than this share of the start's median edge count as this long."""
+"""Lower limit of edge lengths in the residuals, as a share of the initial median edge length."""
 MIN_SCALE = 1e-6
-"""Of the loss, radians; no relative pose is better, and exact data keep a finite scale."""
+"""Lower limit of the scale of the loss, radians; below the noise of any relative pose, and finite for exact data."""
 RAYLEIGH_MEDIAN = 1.1774
-"""Median length of two independent normal deviates of deviation 1, as a direction's error has in its tangent plane."""
-FIRST_DAMPING, MAX_DAMPING = 1.0, 1e8
-"""Shares of each camera's mean curvature. The first is large, to keep to the start's valley."""
+"""Median length of a vector of two independent standard normal deviates, such as a direction's error in its tangent
+plane."""
+INITIAL_DAMPING, MAX_DAMPING = 1.0, 1e8
+"""Initial and largest damping, as shares of each camera's mean curvature. A large initial value keeps the iteration in
+the basin of the initial positions."""
 ROUGH_TOLERANCE = 1e-4
-"""Of the first minimum, which only has to tell the noise."""
+"""Tolerance of the first minimisation, from which only the noise is estimated."""
 NUM_SAMPLES = 64
-"""Draws of noise from which deviations are estimated: within 9 % of their value."""
+"""Number of noise samples from which standard deviations are estimated, to within 9 %."""
 EDGES_PER_BIN, MAX_NUM_BINS = 50, 12
-"""Edges of about one length whose noise is taken together; the median of fifty is within a tenth of its value."""
+"""Edges per bin of similar length whose noise is estimated together (the median of fifty is within a tenth of its
+value), and largest number of bins."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobustDirections:
-    """Positions with what the directions say of their quality.
+    """Positions with the weights and the noise of the directions.
 
     Attributes
     ----------
     positions : PositionResult
-        `lambdas` are lengths, `cost` is the Cauchy cost at the last scale.
+        `lambdas` are edge lengths, `cost` is the Cauchy cost at the last scale.
     weights : (m,) array
-        Of the edges at the minimum: the given ones times the loss's.
+        Weights of the edges at the minimum: squared-residual weights times those of the loss.
     sigmas : (m,) array
         Standard deviation of each direction in each axis of its tangent plane, radians.
     """
@@ -80,13 +83,13 @@ def solve_robust_directions(
     directions_world : (m, 3) array
         Unit ``gamma_ij``, world frame.
     initial_centers : (n, 3) array
-        Near the answer, as Alg. 1C leaves them; their spread is kept.
+        Initial positions close to the solution, such as those of Alg. 1C; their spread is kept.
     weights : (m,) array, optional
         Multipliers of the squared residuals, default 1.
     max_num_iterations : int
-        Accepted steps.
+        Maximum number of accepted steps.
     tolerance : float
-        On the relative change of the cost that a step makes.
+        Relative change of the cost below which the iteration ends.
 
     Returns
     -------
@@ -118,10 +121,10 @@ def solve_robust_directions(
 def _minimized(
     problem: "_Problem", p: Array, log: list[LogEntry], max_num_iterations: int, tolerance: float
 ) -> tuple["_Point", float, bool]:
-    """The minimum from given positions, the loss's scale, and whether the cost stood still."""
-    at, scale, damping = problem.at(p), np.inf, FIRST_DAMPING
+    """Minimise from given positions; return the minimum, the scale of the loss, and whether the cost converged."""
+    at, scale, damping = problem.at(p), np.inf, INITIAL_DAMPING
     for iteration in range(1, max_num_iterations + 1):
-        # It only shrinks, so that the cost falls from step to step.
+        # The scale only decreases, so that the cost decreases from step to step.
         scale = min(scale, max(EFFICIENT_CAUCHY * problem.sigma(at), MIN_SCALE))
         cost = problem.cost(at, scale)
         found = problem.step(at, scale, cost, damping)
@@ -136,8 +139,8 @@ def _minimized(
 
 
 def _noise_by_length(at: "_Point", weights: Array, num_images: int) -> Array:
-    """Standard deviations (m,) of directions, by the residuals of edges of about the same length and their weights."""
-    # Two equations an edge, three unknowns a camera but for translation and scale.
+    """Standard deviations (m,) of directions, radians, from the weighted residuals of edges of similar length."""
+    # Two equations per edge, three unknowns per camera, minus translation and scale.
     num_equations = 2 * len(weights)
     freedom = np.sqrt(num_equations / max(num_equations - (3 * num_images - 4), 1))
     whitened = np.linalg.norm(at.r, axis=1) * np.sqrt(weights)
@@ -157,10 +160,10 @@ def position_deviations(
     *,
     num_samples: int = NUM_SAMPLES,
 ) -> Array:
-    """Standard deviation of each position under the directions' noise, to first order.
+    """Standard deviation of each position under the noise of the directions, to first order.
 
-    Draws of noise go through the normal equations at the minimum: a solve each, and no inverse. Translation and scale
-    are taken out by medians, so that one camera that nothing fixes leaves the others' deviations alone.
+    Noise samples are propagated through the normal equations at the minimum, one solve each. Translation and scale are
+    removed by medians, so that a poorly determined camera does not affect the deviations of the others.
 
     Parameters
     ----------
@@ -168,12 +171,14 @@ def position_deviations(
     edges : (m, 2) int array
     solved : RobustDirections
     seed : int
+        Random seed of the noise samples.
     num_samples : int
+        Number of noise samples.
 
     Returns
     -------
     (n,) array
-        Root of the covariance's trace, in the unit of the positions.
+        Square root of the trace of each position's covariance, in the unit of the positions.
     """
     p, w = solved.positions.projection_centers, solved.weights
     problem = _Problem(num_images, edges, np.zeros((len(edges), 3)), w, p)
@@ -194,7 +199,7 @@ def position_deviations(
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """Positions (n, 3), residuals (m, 3), lengths (m,) that edges count with, ``-length dr/db`` (m, 3, 3)."""
+    """Positions (n, 3), residuals (m, 3), bounded edge lengths (m,), and ``-length dr/db`` (m, 3, 3)."""
 
     p: Array
     r: Array
@@ -225,7 +230,7 @@ class _Problem:
         return self._w * cauchy_weight(self._w * np.sum(at.r**2, axis=1) / scale**2)
 
     def sigma(self, at: _Point) -> float:
-        """Robust standard deviation of the weighted residuals in each axis of their tangent planes."""
+        """Robust standard deviation of the weighted residuals per axis of their tangent planes."""
         return float(np.median(np.linalg.norm(at.r, axis=1) * np.sqrt(self._w))) / RAYLEIGH_MEDIAN
 
     def blocks(self, at: _Point, weights: Array) -> Array:
@@ -237,12 +242,12 @@ class _Problem:
     def factor(self, blocks: Array, damping: float) -> Factor:
         on_diagonal = sum_at_nodes(self._n, self._i, blocks) + sum_at_nodes(self._n, self._j, blocks)
         curvature = np.trace(on_diagonal, axis1=1, axis2=2) / 3.0
-        # Translation and scale are free: damping far below the answer's rounding makes the matrix definite.
+        # Translation and scale are free: damping far below the rounding of the result makes the matrix definite.
         added = damping * curvature + 1e-10 * curvature.mean()
         return factorize(self._pattern.assemble(blocks, blocks, -blocks, added[:, None, None] * np.eye(3)))
 
     def step(self, at: _Point, scale: float, cost: float, damping: float) -> tuple[_Point, float, float] | None:
-        """The next point, its cost and the damping that led there; None where no step lowers the cost."""
+        """The next point, its cost and the damping used; None if no step lowers the cost."""
         w = self.robust_weights(at, scale)
         blocks = self.blocks(at, w)
         pull = self.at_images((w / at.length)[:, None] * np.einsum("kab,kb->ka", at.tangent, at.r)).ravel()

@@ -1,10 +1,10 @@
-"""ShapeFit: ``min sum w ||P (p_j - p_i)||`` with P across gamma; ``sum gamma . (p_j - p_i) = 1``, ``sum p = 0``.
+"""ShapeFit: ``min sum w ||P (p_j - p_i)||``, P perpendicular to gamma; ``sum gamma . (p_j - p_i) = 1``, ``sum p = 0``.
 
-Hand, Lee & Voroninski 2015; Goldstein et al., ECCV 2016. A second-order cone program, convex: every start ends at the
-same cost. It is solved with its dual, ``max mu`` subject to ``B^T w v = mu B^T gamma``, ``||v|| <= 1``, v across
-gamma (B the incidence of edges). Norms are smoothed, ``s = sqrt(||r||^2 + e^2)``, and Newton's method solves
-``s v = r`` in positions and multipliers together (Chan, Golub & Mulet, SISC 1999), which stays fast as e shrinks with
-the duality gap. The gap is the test of convergence.
+Hand, Lee & Voroninski 2015; Goldstein et al., ECCV 2016. A convex second-order cone program without local minima. It is
+solved together with its dual, ``max mu`` subject to ``B^T w v = mu B^T gamma``, ``||v|| <= 1``, v perpendicular to
+gamma (B is the incidence matrix). Norms are smoothed, ``s = sqrt(||r||^2 + e^2)``, and Newton's method solves
+``s v = r`` in positions and multipliers jointly (Chan, Golub & Mulet, SISC 1999), which converges fast while e
+decreases with the duality gap. The relative duality gap is the convergence criterion.
 """
 
 import numpy as np
@@ -19,18 +19,19 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 DAMPING = 1e-12
-"""Share of each camera's stiffness added to it: it fixes translations, and the scale where nothing pulls."""
+"""Share of each camera's stiffness added to it: it fixes translations, and the scale if residuals vanish."""
 SMOOTHING_SHARE = 0.1
-"""Smoothing for the next step: this share of the gap, spread over the edges that can feel it."""
-MAX_SHRINK = 0.1
-"""The smoothing falls by no more than this factor in a step."""
+"""Smoothing e of the next step: this share of the duality gap, divided by the weight of edges with zero residual."""
+MAX_DECREASE = 0.1
+"""Smallest ratio of the smoothing to that of the previous step."""
 PATIENCE = 10
-"""Steps without a smaller gap after which to stop."""
+"""Number of steps without a smaller gap after which the iteration ends."""
 MIN_STEP = 2.0**-10
+"""Smallest step length of the line search."""
 REFINEMENTS = 2
-"""Turns of each linear solve."""
+"""Number of iterations of each linear solve, to reduce rounding errors."""
 ROUNDING = 1e-13
-"""Costs below this share of the sum of weighted lengths are zero: the directions agree exactly."""
+"""Costs below this share of the sum of weighted lengths are zero: the directions are consistent."""
 
 
 def solve_shapefit(
@@ -42,7 +43,7 @@ def solve_shapefit(
     max_num_iterations: int = 200,
     tolerance: float = 1e-6,
 ) -> PositionResult:
-    """Positions of least unsquared distance across the directions.
+    """Solve for positions that minimise the unsquared distance perpendicular to the directions.
 
     Parameters
     ----------
@@ -55,14 +56,14 @@ def solve_shapefit(
     weights : (m,) array, optional
         Multipliers of the (unsquared) residuals, default 1; the constraint stays unweighted.
     max_num_iterations : int
-        Newton steps.
+        Maximum number of Newton steps.
     tolerance : float
-        On the duality gap, relative to the cost.
+        Duality gap at convergence, relative to the cost.
 
     Returns
     -------
     PositionResult
-        ``sum gamma . (p_j - p_i) = 1``; `lambdas` are these products; `change` in the log is the relative gap.
+        ``sum gamma . (p_j - p_i) = 1``; `lambdas` are the terms of this sum; `change` in the log is the relative gap.
 
     Raises
     ------
@@ -82,18 +83,18 @@ def solve_shapefit(
             best, best_cost = p, cost
         if gap < best_gap:
             best_gap, best_iteration = gap, iteration
-        # A gap that no longer closes has come down to rounding.
+        # A gap that no longer decreases has reached rounding.
         if best_gap <= tolerance * best_cost or iteration >= best_iteration + PATIENCE:
             break
         wanted = SMOOTHING_SHARE * gap / problem.weight_of_kinks
-        smoothing = float(np.clip(wanted, MAX_SHRINK * smoothing, smoothing))
+        smoothing = float(np.clip(wanted, MAX_DECREASE * smoothing, smoothing))
         p, v = problem.improve(p, v, smoothing)
     converged = best_gap <= tolerance * best_cost
     return PositionResult(best, problem.along(best), best_cost, len(log), converged, tuple(log))
 
 
 class _ShapeFit:
-    """The objective, its smoothed Newton steps within the constraints, and the dual bound."""
+    """Objective, constrained Newton steps on its smoothed form, and dual bound."""
 
     def __init__(self, num_images: int, edges: IntArray, directions: Array, w: Array) -> None:
         self._n, self._i, self._j = num_images, edges[:, 0], edges[:, 1]
@@ -102,11 +103,11 @@ class _ShapeFit:
         self._pattern = BlockPattern(num_images, edges, 3)
         self._constraint = self._at_nodes(directions)
         self._least_squares_factor = self._factor(w[:, None, None] * self._across)
-        # No more edges than there are unknowns lie exactly along their directions; only these feel the smoothing.
+        # At most as many edges as unknowns have zero residual; only these are affected by the smoothing.
         self.weight_of_kinks = float(w.mean()) * min(len(w), 3 * num_images)
 
     def least_squares(self) -> Array:
-        """The minimum of the squared residuals within the constraints."""
+        """Positions that minimise the squared residuals under the constraints."""
         H, factor = self._w[:, None, None] * self._across, self._least_squares_factor
         p = self._scaled(self._solve(factor, self._constraint))
         gradient = self._at_nodes(self._w[:, None] * self._residual(p))
@@ -125,7 +126,7 @@ class _ShapeFit:
         return self.cost(p) <= ROUNDING * float(np.sum(self._w * np.linalg.norm(p[self._j] - p[self._i], axis=1)))
 
     def gap(self, p: Array, v: Array) -> float:
-        """Cost above a dual bound, that of v made feasible by the least change and brought back into the unit balls."""
+        """Cost minus a dual bound, from v made feasible by the least change and scaled back into the unit balls."""
         sums = self._at_nodes(self._w[:, None] * v)
         mu = float(np.vdot(sums, p))
         missing = self._solve(self._least_squares_factor, sums - mu * self._constraint)
@@ -134,7 +135,7 @@ class _ShapeFit:
         return self.cost(p) - bound
 
     def improve(self, p: Array, v: Array, smoothing: float) -> tuple[Array, Array]:
-        """Newton's step on ``s v = r`` in positions and multipliers."""
+        """Take a Newton step on ``s v = r`` in positions and multipliers."""
         r = self._residual(p)
         s = np.hypot(np.linalg.norm(r, axis=1), smoothing)[:, None]
         gradient = self._at_nodes(self._w[:, None] * r / s)
@@ -143,7 +144,7 @@ class _ShapeFit:
         step = self._constrained_step(H, self._factor(H), gradient)
         moved = self._residual(step)
         turned = (r + moved - 0.5 * (v * self._dot(r, moved) + r * self._dot(v, moved)) / s) / s
-        # Rounding along gamma, divided by s, would spoil the bound.
+        # Rounding errors along gamma, divided by s, would invalidate the bound.
         turned = np.einsum("kab,kb->ka", self._across, turned)
         slope, start = float(np.vdot(step, gradient)), self._smooth_cost(p, smoothing)
         length = 1.0
@@ -171,7 +172,7 @@ class _ShapeFit:
         while True:
             try:
                 return factorize(self._pattern.assemble(H, H, -H, level))
-            except SingularMatrixError:  # weights that differ by many orders: rounding eats the damping
+            except SingularMatrixError:  # weights differ by many orders of magnitude: the damping is lost to rounding
                 level = 10.0 * level
 
     @staticmethod
@@ -179,10 +180,10 @@ class _ShapeFit:
         return centered(factor.solve(b.ravel()).reshape(-1, 3))
 
     def _constrained_step(self, H: Array, factor: Factor, gradient: Array) -> Array:
-        """``-H⁻¹ (gradient - mu g)``, mu such that g, the constraint's gradient, is not moved along."""
+        """Step ``-H⁻¹ (gradient - mu g)``, with mu such that it is perpendicular to g, the constraint's gradient."""
         normal = self._solve(factor, self._constraint)
         step, left = np.zeros_like(gradient), -gradient
-        # Both parts are long where H is soft, along p, and cancel: the second turn mends what rounding left.
+        # Both parts are long along p, where H is nearly singular, and cancel: a second iteration reduces rounding.
         for _ in range(REFINEMENTS):
             down = self._solve(factor, left)
             mu = np.vdot(self._constraint, step + down) / np.vdot(self._constraint, normal)
@@ -195,7 +196,7 @@ class _ShapeFit:
         return np.asarray(step)
 
     def _scaled(self, p: Array) -> Array:
-        """Positions put back on the constraint, from which rounding takes them."""
+        """Positions scaled to satisfy the constraint up to rounding."""
         return centered(p) / float(np.vdot(self._constraint, p))
 
 
@@ -204,8 +205,8 @@ def _share_inside(v: Array, step: Array) -> float:
     a, b = np.einsum("ka,ka->k", step, step), np.einsum("ka,ka->k", v, step)
     c = np.minimum(np.einsum("ka,ka->k", v, v) - 1.0, 0.0)
     root = np.sqrt(b * b - a * c)
-    # The positive root of a t^2 + 2 b t + c = 0, in the form that does not cancel.
+    # The positive root of a t^2 + 2 b t + c = 0, in the form without cancellation.
     far = np.where(b > 0, -c, root - b)
     below = np.where(b > 0, b + root, a)
     share = float(np.min(np.where(far >= below, 1.0, far / np.where(below > 0, below, 1.0)), initial=1.0))
-    return share if share == 1.0 else 0.99 * share  # on the sphere itself the next step would be stuck
+    return share if share == 1.0 else 0.99 * share  # on the sphere itself the next step would have length zero

@@ -26,9 +26,9 @@ from colmap_vg.two_view.edge_information import refine_relative_poses
 from colmap_vg.two_view.eight_point import estimate_essential_from_inliers
 from colmap_vg.two_view.essential import (
     RelativePoses,
+    check_cheirality,
     essential_from_fundamental,
     essential_from_pose,
-    judged_poses,
     poses_from_essential,
 )
 from colmap_vg.two_view.homography import calibrated_homography, poses_from_homography, pure_rotations
@@ -123,7 +123,7 @@ class _Matches:
         return segment_sums(self.offsets, within.astype(np.float64)) / np.maximum(np.diff(self.offsets), 1)
 
     def judged(self, rotations: Array, directions: Array) -> RelativePoses:
-        return judged_poses(rotations, directions, self.offsets, self.bearings1, self.bearings2)
+        return check_cheirality(rotations, directions, self.offsets, self.bearings1, self.bearings2)
 
     def of(self, pairs: IntArray) -> "_Matches":
         rows, offsets = rows_of_segments(self.offsets, pairs)

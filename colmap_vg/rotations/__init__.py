@@ -1,1 +1,1 @@
-"""Rotation averaging: spanning tree, chordal optimum with its certificate, robust averaging."""
+"""Rotation averaging: spanning tree, certified chordal optimum, robust averaging, and consensus over several starts."""

@@ -1,7 +1,8 @@
-"""The nearest other solution: images whose own edges would have them elsewhere almost as well, moved there.
+"""Alternative rotations a few images away: images are moved to the second-best rotation that their own edges support.
 
-A fold has a seam, and where a scene repeats itself the seam may lie anywhere: the images beside it fit as well on its
-other side. No start needs to find that other fold; it is a few images away.
+In scenes that repeat themselves, parts of the model may be folded onto each other. Images beside the seam of such a
+fold often fit as well on its other side. Starts from elsewhere need not find this solution, but it differs in a few
+images only.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ def nearest_alternative(
     rotations: Array,
     num_moved: int,
 ) -> Array:
-    """Rotations after the images that lose least by it have been turned to their second choice, one after the other.
+    """Move images to their second-best rotation, one by one, each time the image that loses least support.
 
     Parameters
     ----------
@@ -30,17 +31,18 @@ def nearest_alternative(
     edges : (m, 2) int array
     cam2_from_cam1_rotations : (m, 3, 3) array
     weights : (m,) array
-        Votes of each edge.
+        Weight of each edge's vote.
     rotations : (n, 3, 3) array
-        cam_from_world.
+        cam_from_world rotations.
     num_moved : int
-        At most; fewer where no other image's edges agree on a second choice.
+        Maximum number of images to move; fewer are moved if no other image has a second rotation that edges support.
 
     Returns
     -------
     (n, 3, 3) array
+        cam_from_world rotations.
     """
-    # Each edge votes at both of its images, the heaviest first.
+    # Each edge votes for both of its images, the heaviest edges first.
     own, other = edges.T.ravel(), edges[:, ::-1].T.ravel()
     votes = np.tile(weights, 2)
     relative = quaternions.from_matrices(cam2_from_cam1_rotations)
@@ -52,7 +54,7 @@ def nearest_alternative(
     q, moved = quaternions.from_matrices(rotations), np.zeros(num_images, dtype=bool)
     still = np.array([0.0, 0.0, 0.0, 1.0])[:, None]
     for _ in range(num_moved):
-        # R_i Q is where the edge would have image i.
+        # R_i Q is the rotation of image i that the edge votes for.
         wanted = quaternions.multiply(to_own, q[:, other])
         turn = quaternions.multiply(quaternions.conjugate(q[:, own]), wanted)
         here = agree_within(turn, still)

@@ -1,4 +1,4 @@
-"""Is a chordal optimum global? The dual certificate of rotation averaging.
+"""Dual certificate of global optimality for chordal rotation averaging.
 
 Eriksson et al., "Rotation Averaging and Strong Duality" (CVPR 2018); Rosen et al., SE-Sync (IJRR 2019). At a stationary
 point X of ``f(X) = 6 sum w - tr(X^T W X)`` the multipliers of ``R_i R_i^T = I`` are ``Lambda_i = sym((W X)_i R_i^T)``.
@@ -20,19 +20,19 @@ from colmap_vg.rotations.problem import checked_initial, checked_problem
 
 @dataclass(frozen=True)
 class ChordalCertificate:
-    """What the certificate matrix says of given rotations.
+    """Optimality certificate of given rotations.
 
     Attributes
     ----------
     smallest_eigenvalue : float
-        Of ``S = Lambda - W``, in the unit of the weights. S has the three columns of X in its kernel, so at a global
-        optimum this is zero up to rounding.
+        Smallest eigenvalue of ``S = Lambda - W``, in the unit of the weights. The three columns of X are in the kernel
+        of S, so at a global optimum this is zero up to rounding.
     is_global : bool
-        Whether the smallest eigenvalue is above minus the tolerance times the largest weighted degree.
+        Whether the smallest eigenvalue is at least minus the tolerance times the largest weighted degree.
     cost : float
         Chordal cost of the rotations.
     lower_bound : float
-        No rotations have a lower chordal cost than this.
+        Lower bound on the chordal cost of any rotations.
     relative_gap : float
         ``(cost - lower_bound) / cost``; ``(cost - lower_bound) / sum w`` where the cost is smaller than 1e-12 of that.
     stationarity : float
@@ -55,7 +55,7 @@ def certify_chordal(
     weights: ArrayLike | None = None,
     tolerance: float = 1e-9,
 ) -> ChordalCertificate:
-    """Certificate that rotations are the global optimum of chordal averaging, or the bound on what they may lack.
+    """Certify that rotations are a global optimum of chordal averaging, or bound their suboptimality.
 
     Parameters
     ----------
@@ -65,9 +65,9 @@ def certify_chordal(
     cam_from_world_rotations : (n, 3, 3) array
         The rotations to certify, from `average_rotations_chordal`.
     weights : (m,) array, optional
-        Those of the averaging.
+        Weights used for the averaging. Default: all one.
     tolerance : float
-        Relative to the largest weighted degree.
+        Tolerance on the smallest eigenvalue, relative to the largest weighted degree.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def certify_chordal(
     Raises
     ------
     GraphError
-        The graph is malformed or disconnected, or the rotations are missing.
+        The graph is malformed or disconnected, or the rotations are None.
     """
     edges, relative, w = checked_problem(num_images, edges, cam2_from_cam1_rotations, weights)
     R = checked_initial(num_images, cam_from_world_rotations)

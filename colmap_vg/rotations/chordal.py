@@ -1,10 +1,10 @@
-"""Chordal rotation averaging to its optimum (RS of Nasiri et al.): ``min sum w_ij ||R_ij - R_j R_i^T||_F^2``.
+"""Chordal rotation averaging (RS of Nasiri et al.): ``min sum w_ij ||R_ij - R_j R_i^T||_F^2``.
 
-The start is spectral: the three leading eigenvectors of the normalised block matrix of relative rotations
-(Arie-Nachimson et al., 3DIMPVT 2012), projected on rotations. From there a Riemannian Newton method: conjugate
-gradients on the exact Hessian, preconditioned by the factored scalar graph Laplacian (the Hessian of consistent
-rotations), with a monotone line search (Nocedal & Wright, Alg. 7.1). Negative curvature ends the inner loop, so saddles
-that it can see do not hold it.
+The initial rotations are spectral: the three leading eigenvectors of the normalised block matrix of relative rotations
+(Arie-Nachimson et al., 3DIMPVT 2012), projected on rotations. They are refined by a Riemannian Newton method with
+conjugate gradients on the exact Hessian, preconditioned by the factored scalar graph Laplacian (the Hessian at
+consistent rotations), and a monotone line search (Nocedal & Wright, Alg. 7.1). Negative curvature ends the inner loop,
+so that the iteration leaves saddle points where it encounters negative curvature.
 """
 
 import numpy as np
@@ -23,9 +23,11 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 ARMIJO = 1e-4
+"""Sufficient-decrease constant of the line search, dimensionless."""
 MAX_STEP = 1.0
-"""Radians; beyond it the quadratic model of a rotation says little."""
+"""Largest rotation step of an image, radians; beyond it the quadratic model is inaccurate."""
 MAX_CG_ITERATIONS = 200
+"""Maximum number of conjugate-gradient iterations per Newton step."""
 
 
 def average_rotations_chordal(
@@ -37,7 +39,7 @@ def average_rotations_chordal(
     max_num_iterations: int = 100,
     tolerance: float = 1e-10,
 ) -> RotationResult:
-    """Rotations of least chordal cost.
+    """Average rotations by minimising the chordal cost.
 
     Parameters
     ----------
@@ -48,17 +50,17 @@ def average_rotations_chordal(
     weights : (m,) array, optional
         Multipliers of squared residuals. Default: all one.
     initial : (n, 3, 3) array, optional
-        Start in place of the spectral one.
+        Initial cam_from_world rotations. Default: spectral.
     max_num_iterations : int
-        Newton steps.
+        Maximum number of Newton steps.
     tolerance : float
-        Largest step of an image at which the iteration ends, radians. Convergence is quadratic: the step after it
-        would be far smaller.
+        The iteration ends when no image's step is longer, radians. Convergence is quadratic: the next step would be far
+        smaller.
 
     Returns
     -------
     RotationResult
-        `cost` is the chordal objective. The gauge is that of the start.
+        `cost` is the chordal objective. The gauge is that of the initial rotations.
 
     Raises
     ------
@@ -89,7 +91,7 @@ def average_rotations_chordal(
         while True:
             trial = so3.project(R @ so3.exp(length * v))
             trial_cost = chordal_cost(edges, relative, w, trial)
-            # Steps whose effect drowns in rounding are taken: the cost cannot judge them, the gradient can.
+            # Accept steps whose expected decrease is below rounding: the cost cannot judge them, the gradient can.
             if trial_cost <= cost + ARMIJO * length * slope or -length * slope <= rounding:
                 break
             length *= 0.5
@@ -103,12 +105,12 @@ def average_rotations_chordal(
 
 
 def _newton_direction(model: TangentQuadratic, preconditioner: Factor) -> Array:
-    """Truncated conjugate gradients on ``H v = -g``; a descent direction whatever the curvature."""
+    """Descent direction by truncated conjugate gradients on ``H v = -g``, for any curvature."""
     g = model.gradient
     v, r = np.zeros_like(g), -g
     z = _without_gauge(preconditioner, r)
     p, rz = z, float(np.einsum("na,na->", r, z))
-    # The looser of quadratic convergence (eta ~ |g|) and a tenth; |g| measured as a step, in radians.
+    # Forcing term for quadratic convergence (eta ~ |g|), at most a tenth; |g| is measured as a step, in radians.
     eta = min(0.1, max(float(np.linalg.norm(z, axis=1).max()), 1e-8))
     goal = eta * eta * rz
     for iteration in range(MAX_CG_ITERATIONS):
@@ -129,13 +131,13 @@ def _newton_direction(model: TangentQuadratic, preconditioner: Factor) -> Array:
 
 
 def _without_gauge(preconditioner: Factor, r: Array) -> Array:
-    """Pseudo-inverse of the Laplacian on r: no common rotation enters or leaves."""
+    """Pseudo-inverse of the Laplacian applied to r, with common rotations of all images projected out."""
     x = preconditioner.solve(r - r.mean(axis=0))
     return np.asarray(x - x.mean(axis=0))
 
 
 def _spectral_start(num_images: int, edges: IntArray, weights: Array, W: sp.bsr_array) -> Array:
-    """Projections of the three leading eigenvectors of ``D^-1/2 W D^-1/2``, the blocks' weighted degrees in D."""
+    """Rotations from the three leading eigenvectors of ``D^-1/2 W D^-1/2``, with the weighted degrees D."""
     if num_images == 1:
         return np.eye(3)[None]
     degree = np.bincount(edges[:, 0], weights, num_images) + np.bincount(edges[:, 1], weights, num_images)
@@ -143,7 +145,7 @@ def _spectral_start(num_images: int, edges: IntArray, weights: Array, W: sp.bsr_
     normalized = sp.csc_array(sp.eye_array(3 * num_images) - scale @ W.tocsr() @ scale)
     _, vectors = smallest_eigenpairs(normalized, 3, tolerance=1e-3)  # a start: Newton does the rest
     blocks = vectors.reshape(num_images, 3, 3)
-    # Eigenvectors come with a common orthogonal factor of either sign; rotations want the one of positive determinant.
+    # Eigenvectors are determined up to a common orthogonal factor: choose its sign so that determinants are positive.
     if np.sum(np.sign(np.linalg.det(blocks))) < 0:
         blocks = blocks * np.array([1.0, 1.0, -1.0])
     return so3.project(blocks)

@@ -1,8 +1,8 @@
 """Chordal rotation averaging as a quadratic form: ``f(X) = 6 sum w - tr(X^T W X)``.
 
 X stacks the cam_from_world rotations, (3n, 3). W is the symmetric block matrix with ``w_ij R_ij`` at (j, i) and its
-transpose at (i, j), so that ``sum w_ij ||R_ij - R_j R_i^T||_F^2`` is the f above. Gradient, Hessian, certificate and
-spectral start all come from products with W.
+transpose at (i, j), so that ``sum w_ij ||R_ij - R_j R_i^T||_F^2`` equals f. Gradient, Hessian, certificate and spectral
+initialisation are computed from products with W.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ IntArray = NDArray[np.int64]
 
 
 def chordal_matrix(num_images: int, edges: IntArray, relative: Array, weights: Array) -> sp.bsr_array:
-    """W, (3n, 3n), in 3 x 3 blocks."""
+    """The matrix W, (3n, 3n), stored in 3 x 3 blocks."""
     rows = np.concatenate([edges[:, 1], edges[:, 0]])
     cols = np.concatenate([edges[:, 0], edges[:, 1]])
     blocks = weights[:, None, None] * relative
@@ -29,13 +29,13 @@ def chordal_matrix(num_images: int, edges: IntArray, relative: Array, weights: A
 
 
 def chordal_cost(edges: IntArray, relative: Array, weights: Array, R: Array) -> float:
-    """``sum w_ij ||R_ij - R_j R_i^T||_F^2``, from the residuals: no cancellation where it is nearly zero."""
+    """``sum w_ij ||R_ij - R_j R_i^T||_F^2``, computed from the residuals to avoid cancellation near zero."""
     difference = relative @ R[edges[:, 0]] - R[edges[:, 1]]
     return float(np.einsum("k,kab,kab->", weights, difference, difference))
 
 
 def block_diagonal(blocks: Array) -> sp.bsr_array:
-    """(n, 3, 3) blocks as a (3n, 3n) matrix."""
+    """Block-diagonal matrix (3n, 3n) of blocks (n, 3, 3)."""
     n = len(blocks)
     return sp.bsr_array((blocks, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
 

@@ -1,9 +1,10 @@
-"""Rotations that most verified matches agree with: several starts, the one of largest consensus, then precision.
+"""Robust rotation averaging from several starts, with the solution of largest weighted consensus.
 
-Averaging with a robust loss finds the valley that it starts in. Where nearly half of the edges are false and agree
-among themselves, that valley is often a fold; what tells the right one is how many edges agree with it, each by the
-odds that it is right. These are learned: edges with more inliers are right more often, how much more depends on the
-scene. Information says how precise an edge is if it is right: it refines, inside the consensus that was chosen.
+Robust averaging converges to a local minimum near its start. If nearly half of the edges are false and consistent among
+themselves, that minimum is often a folded model. The candidate with the largest consensus is chosen, where each edge is
+weighted by the log odds that it is correct. These are learned: edges with more inliers are correct more often, but by
+how much depends on the scene. The information of an edge, its precision if it is correct, is used only in the final
+refinement within the chosen consensus.
 """
 
 from collections.abc import Iterator
@@ -28,55 +29,62 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 CLEAR_CONSENSUS = 0.97
-"""Consensus from which on no other start is tried: on graphs of photographs it was above 0.98 wherever few pairs were
-false."""
+"""Consensus of the first candidate from which on no other start is tried. On graphs of photographs it was above 0.98
+wherever few pairs were false."""
 MAX_RIVAL_SHARE = 0.02
-"""Or of the triangles of edges that disagree, those that close (`rival_share`), up to which no other start is tried. On
-graphs of 1DSfM with 30 % false edges at random it was below 0.01, with 15 % that agree in groups above 0.6, and on
-graphs of objects that repeat themselves mostly above 0.05."""
+"""Share of closing triangles among disagreeing edges (`rival_share`) up to which no other start is tried either. On
+graphs of 1DSfM with 30 % false edges at random it was below 0.01, with 15 % false edges consistent in groups above 0.6,
+and on graphs of objects that repeat themselves mostly above 0.05."""
 SKELETON_EDGES = 6
-"""Edges of each image, its heaviest, by which a first candidate is chosen to learn from. What repeats makes many pairs,
-and weaker ones: of 100 graphs of objects that repeat themselves the consensus of all edges chose right in 90, that of
-the heaviest in 98; but it is a sample of the evidence only, and where likelihoods tell nothing, a poor one."""
+"""Number of edges per image, the heaviest, whose consensus selects the candidate that log odds are learned from.
+Repeated structure causes many but weaker pairs: of 100 graphs of objects that repeat themselves, the consensus of all
+edges selected the correct candidate in 90, that of the heaviest edges in 98. It is a subsample only, and a poor one if
+likelihoods are not informative."""
 BACKBONE_EDGES = 2
+"""Number of edges per image, the heaviest, of the backbone solution."""
 NUM_GROUPS = 10
-"""Of edges with like likelihoods, each as many, whose shares of agreement with the first candidate are learned."""
-TELLING_LOG_ODDS = 3.0
-"""From the least to the most likely edges: where likelihoods tell so much, only each image's heaviest edges count."""
+"""Number of equally large groups of edges of similar likelihood, for each of which the log odds are learned."""
+INFORMATIVE_LOG_ODDS = 3.0
+"""Range of the log odds over all edges above which only the heaviest edges of each image count."""
 VOTES = ((20, 4.0), (20, 10.0), (20, 1.0), (10, 4.0), (6, 4.0))
-"""Starts by votes: how many of each image's heaviest edges vote, and up to which likelihood over the median's."""
+"""Starts by votes: number of voting edges per image, the heaviest, and upper limit of their likelihood over the
+median."""
 RANDOM_VOTES, NUM_RANDOM_STARTS, RANDOM_SPREAD = (20, 8), 8, 0.5
-"""Starts by votes whose weights are multiplied at random, log-normally, in turn of so many edges an image."""
+"""Random starts: voting edges per image (alternating), number of starts, and standard deviation of the log-normal
+factors on the weights."""
 MAX_EDGES_OF_STARTS = 60_000
-"""Edges of all random starts together, at most. Fewer starts than these find the same solution on large graphs, but not
-its rivals: on graphs of 1DSfM with false edges in groups, a third of the doubts were lost."""
+"""Upper limit of the voting edges of all random starts together. Fewer starts find the same solution on large graphs,
+but fewer alternatives: on graphs of 1DSfM with false edges in groups, a third of the doubtful cases were missed."""
 AVERAGED_EDGES = 40
-"""Edges of each image, its heaviest, by which candidates are averaged; the winner by all."""
+"""Number of edges per image, the heaviest, used to average candidates; the winner is averaged over all edges."""
 MIN_CLOSING_SHARE = 0.01
+"""Lower limit of the closing shares used as factors on the weights of votes."""
 MAX_NUM_MOVED = 10
-"""Images that the nearest other solution may be away; on larger graphs random starts end in different folds."""
+"""Maximum number of images moved to form the nearest alternative; on larger graphs random starts find other folds."""
 NUM_ALIGNMENTS = 32
+"""Number of images whose rotations are tried to align two solutions."""
 SAME_DEG, SAME_SHARE = 15.0, 0.95
-"""Two solutions are the same where so large a share of the images is turned by no more than this between them."""
+"""Two solutions are the same if at least this share of the images differs by no more than this angle, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
 class ConsensusRotations:
-    """The rotations that won, and how clearly.
+    """Rotations of largest consensus, with their lead over alternative solutions.
 
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
     lead : float
-        Over the nearest solution that is another one, as a share of the weight of the edges that agree with just one of
-        the two; by likelihoods or by learned odds, whichever is larger. 1 where there was no other, or none was looked
-        for.
+        Lead over the closest competing solution, as a share of the weight of the edges that agree with exactly one of
+        the two; by likelihoods or by learned log odds, whichever is larger. 1 if there was no other solution, or none
+        was searched for.
     rival_images : (n,) bool array
-        Images that the nearest other solution turns otherwise.
+        Images whose rotation differs in the closest competing solution.
     rivals : tuple of (n, 3, 3) arrays
-        That solution, and the one that each image's two heaviest edges make, where these are others than the winner.
+        cam_from_world rotations of that solution, and of the one from the two heaviest edges of each image, as far as
+        they differ from the winner.
     log : tuple of LogEntry
-        Of the averaging that refined the winner.
+        Log of the averaging that refined the winner.
     """
 
     cam_from_world_rotations: Array
@@ -94,20 +102,20 @@ def average_rotations_by_consensus(
     weights: Array,
     seed: int = 0,
 ) -> ConsensusRotations:
-    """Rotations of the largest consensus.
+    """Average rotations from several starts and return the solution of largest weighted consensus.
 
     Parameters
     ----------
     num_images : int
     edges : (m, 2) int array
-        Of a connected graph.
+        The graph must be connected.
     cam2_from_cam1_rotations : (m, 3, 3) array
     likelihoods : (m,) array
-        Positive, proportional to the evidence that an edge is right: its number of inliers.
+        Positive evidence that each edge is correct, of any scale: its number of inliers.
     weights : (m,) array
-        Precisions of the edges' rotations, for the last phase.
+        Precisions of the edges' rotations, for the final refinement.
     seed : int
-        Of the random starts.
+        Random seed of the random starts.
 
     Returns
     -------
@@ -116,7 +124,7 @@ def average_rotations_by_consensus(
     search = _Search(num_images, edges, cam2_from_cam1_rotations, likelihoods)
     search.add(search.averaged(None, l1=True))
     if not search.is_clear():
-        # On graphs of many edges the heaviest are enough to find the valley in.
+        # On graphs with many edges the heaviest suffice to find the local minima.
         search.average_by(AVERAGED_EDGES)
         search.add_backbone()
         for start, l1 in _starts(search, seed):
@@ -130,7 +138,7 @@ def average_rotations_by_consensus(
 
 
 def _starts(search: "_Search", seed: int) -> Iterator[tuple[Array, bool]]:
-    """Rotations by votes to average from, and whether the L1 phase is to come first."""
+    """Initial rotations by votes, and whether averaging from them starts with the L1 phase."""
     yield search.votes(*VOTES[0]), False
     closing = search.votes(*VOTES[0], search.closing_shares())
     yield closing, False
@@ -146,7 +154,7 @@ def _starts(search: "_Search", seed: int) -> Iterator[tuple[Array, bool]]:
 
 
 class _Search:
-    """Candidates and the edges that agree with each."""
+    """Candidate rotations, with the edges that agree with each."""
 
     def __init__(self, num_images: int, edges: IntArray, relative: Array, likelihoods: Array) -> None:
         self.num_images, self.edges, self.relative = num_images, edges, relative
@@ -160,38 +168,40 @@ class _Search:
         self._agree: list[BoolArray] = []
 
     def add(self, rotations: Array) -> None:
-        """Take a candidate in."""
+        """Add a candidate."""
         residuals = rotation_residuals(self.edges, self.relative, rotations)
         self._candidates.append(rotations)
         self._agree.append(residuals <= np.radians(AGREEMENT_DEG))
 
     def add_backbone(self) -> None:
-        """Take in the solution that each image's two heaviest edges make.
+        """Add the solution from the two heaviest edges of each image.
 
-        What repeats matches many pairs; pairs of neighbours, who see what does not repeat as well, match best.
+        Repeated structure matches in many pairs, but neighbouring images, which also share unique structure, match
+        best.
         """
         self._backbone = self.averaged(self.votes(BACKBONE_EDGES, np.inf), l1=False)
         self.add(self._backbone)
 
     def add_alternative(self, rotations: Array) -> None:
-        """Take in the nearest other solution, where it is few images away."""
+        """Add the nearest alternative solution if it differs in few enough images."""
         num_moved = int((1.0 - SAME_SHARE) * self.num_images) + 1
         if num_moved <= MAX_NUM_MOVED:
             problem = self.num_images, self.edges, self.relative, self._capped
             self.add(nearest_alternative(*problem, rotations, num_moved))
 
     def average_by(self, per_image: int | None) -> None:
-        """Average candidates from now on by each image's heaviest edges, or by all."""
+        """Average further candidates over the heaviest edges of each image, or over all edges."""
         self._averaged = np.ones(len(self.edges), dtype=bool) if per_image is None else self._heaviest(per_image)
 
     def agree(self) -> bool:
-        """Whether all candidates but the first are one solution."""
+        """Whether all candidates after the first are the same solution."""
         return not any(_differ(self._candidates[1], other) for other in self._candidates[2:])
 
     def is_clear(self) -> bool:
-        """Whether the first candidate needs no other.
+        """Whether the first candidate is so clear that no other start is needed.
 
-        Nearly all of its edges agree, the heaviest too, or those that disagree do so each in its own way.
+        Nearly all edges and nearly all of the heaviest edges agree with it, or the disagreeing edges have independent
+        errors.
         """
         shares = [
             self._capped[among] @ self._agree[0][among] / self._capped[among].sum() for among in (self._skeleton, ...)
@@ -203,19 +213,19 @@ class _Search:
         return rival_share(self.num_images, edges, self.relative[among], self._capped[among], agree) <= MAX_RIVAL_SHARE
 
     def votes(self, per_image: int, cap: float, factors: Array | float = 1.0) -> Array:
-        """Rotations by votes of each image's heaviest edges, their capped likelihoods times factors."""
+        """Rotations by votes of the heaviest edges of each image, weighted by capped likelihoods times factors."""
         voting = self._heaviest(per_image)
         weights = (np.minimum(self._likelihoods, cap) * factors)[voting]
         return rotations_by_votes(self.num_images, self.edges[voting], self.relative[voting], weights)
 
     def closing_shares(self) -> Array:
-        """Of the triangles of edges that vote, above zero; of the others 1."""
+        """Share of closing triangles of each voting edge, at least `MIN_CLOSING_SHARE`; 1 for other edges."""
         among, shares = self._heaviest(VOTES[0][0]), np.ones(len(self.edges))
         shares[among] = closing_shares(self.num_images, self.edges[among], self.relative[among], self._capped[among])
         return np.maximum(shares, MIN_CLOSING_SHARE)
 
     def averaged(self, start: Array | None, *, l1: bool) -> Array:
-        """Rotations averaged by the capped likelihoods from a start, or from the spanning tree."""
+        """Rotations averaged with capped likelihoods as weights, from a start or from the spanning tree."""
         return average_rotations_robust(
             self.num_images,
             self.edges[self._averaged],
@@ -229,7 +239,7 @@ class _Search:
         ).cam_from_world_rotations
 
     def ranked(self) -> tuple[Array, float, BoolArray, tuple[Array, ...]]:
-        """The best candidate, its lead over the nearest other solution, where that one differs, and its rivals."""
+        """The best candidate, its lead over the closest competitor, the images where that differs, and its rivals."""
         if len(self._candidates) == 1:
             return self._candidates[0], 1.0, np.zeros(self.num_images, dtype=bool), ()
         agree = np.array(self._agree, dtype=np.float64)
@@ -237,7 +247,7 @@ class _Search:
         skeleton = np.where(self._skeleton, self._capped, 0.0)
         first = int(np.argmax(agree @ skeleton))
         odds = learned_log_odds(self._likelihoods, self._agree[first])
-        if np.ptp(odds) >= TELLING_LOG_ODDS:
+        if np.ptp(odds) >= INFORMATIVE_LOG_ODDS:
             odds = np.where(self._skeleton, odds, 0.0)
         by_odds = agree @ odds / odds.sum() if odds.any() else of_all
         winner = int(np.lexsort((-of_all, -by_odds))[0])
@@ -246,7 +256,7 @@ class _Search:
         for row, other in enumerate(self._candidates):
             ahead = max(_lead(weights, agree[winner], agree[row]) for weights in (self._capped, odds))
             if ahead < lead:
-                turned = _turned(best, other) > np.radians(SAME_DEG)
+                turned = _rotation_differences(best, other) > np.radians(SAME_DEG)
                 if turned.mean() > 1.0 - SAME_SHARE:
                     lead, apart, rivals = ahead, turned, (other,)
         if self._backbone is not None and all(_differ(self._backbone, other) for other in (best, *rivals)):
@@ -254,9 +264,9 @@ class _Search:
         return best, lead, apart, rivals
 
     def _find_heaviest(self, count: int) -> BoolArray:
-        """Edges (m,) that are among the heaviest of one of their images, and those that join what these leave apart.
+        """Mask (m,) of edges among the `count` heaviest of one of their images, or in the maximum spanning tree.
 
-        All edges where they weigh the same.
+        All edges if all weights are equal.
         """
         weights, num_edges = self._likelihoods, len(self.edges)
         if np.ptp(weights) == 0:
@@ -272,25 +282,26 @@ class _Search:
 
 
 def _lead(weights: Array, agree: Array, other: Array) -> float:
-    """Lead of one solution over another, as a share of the weight that agrees with just one of them."""
+    """Lead of one solution over another, as a share of the weight that agrees with exactly one of them."""
     contested = float(weights @ np.abs(agree - other))
     return float(weights @ (agree - other)) / contested if contested > 0 else 0.0
 
 
 def learned_log_odds(likelihoods: Array, agree: BoolArray) -> Array:
-    """Log odds that an edge is right, by the share that agrees with a candidate among edges of like likelihood.
+    """Log odds that each edge is correct, from the agreement of edges of similar likelihood with a candidate.
 
     Parameters
     ----------
     likelihoods : (m,) array
     agree : (m,) bool array
+        Edges that agree with the candidate.
 
     Returns
     -------
     (m,) array
-        Never falling with the likelihood, and 0 where less than half agree.
+        Non-decreasing in the likelihood; 0 where less than half of the edges agree.
     """
-    from scipy.optimize import isotonic_regression  # a tenth of a second that clear graphs do without
+    from scipy.optimize import isotonic_regression  # the import takes 0.1 s, which clear graphs do not need
 
     place = np.searchsorted(np.sort(likelihoods), likelihoods)  # equal likelihoods go together
     group = np.minimum(NUM_GROUPS * place // max(len(place), 1), NUM_GROUPS - 1)
@@ -300,12 +311,12 @@ def learned_log_odds(likelihoods: Array, agree: BoolArray) -> Array:
 
 
 def _differ(one: Array, other: Array) -> bool:
-    """Whether two solutions are not the same."""
-    return bool((_turned(one, other) > np.radians(SAME_DEG)).mean() > 1.0 - SAME_SHARE)
+    """Whether two solutions differ in more images than `SAME_SHARE` allows."""
+    return bool((_rotation_differences(one, other) > np.radians(SAME_DEG)).mean() > 1.0 - SAME_SHARE)
 
 
-def _turned(one: Array, other: Array) -> Array:
-    """Angles (n,) between two solutions' rotations after the turn of the world that most images agree on, radians."""
+def _rotation_differences(one: Array, other: Array) -> Array:
+    """Angles (n,) between the rotations of two solutions after aligning their world frames robustly, radians."""
     turns = np.swapaxes(one, 1, 2) @ other
     tried = turns[np.linspace(0, len(turns) - 1, min(len(turns), NUM_ALIGNMENTS)).astype(int)]
     angles = so3.angle(np.swapaxes(tried, 1, 2)[:, None] @ turns[None])

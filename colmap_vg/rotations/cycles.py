@@ -1,8 +1,8 @@
-"""How well edges agree with the triangles that they are in: evidence on an edge that needs no absolute rotations.
+"""Cycle consistency of edges over triangles: evidence on an edge that needs no absolute rotations.
 
-The first step of cycle-edge message passing (Lerman & Shi, 2022): of the triangles of an edge, weighed by the weaker of
-their other two edges, the share that closes. False edges that agree among themselves close triangles, too, so this is
-one opinion among others.
+The first step of cycle-edge message passing (Lerman & Shi, 2022) is the share of an edge's triangles whose rotations
+compose to the identity, weighted by the weaker of their other two edges. False edges that are consistent among
+themselves close triangles, too, so this share is only one of several criteria.
 """
 
 import numpy as np
@@ -15,11 +15,11 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 CLOSING_DEG = 8.0
-"""Angle left after a triangle's three rotations at which it counts as closed."""
+"""Largest angle of the composition of a triangle's three rotations at which it counts as closed, degrees."""
 
 
 def closing_shares(num_images: int, edges: IntArray, cam2_from_cam1_rotations: Array, weights: Array) -> Array:
-    """Weighted share of each edge's triangles that close.
+    """Weighted share of each edge's triangles whose rotations compose to the identity.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def closing_shares(num_images: int, edges: IntArray, cam2_from_cam1_rotations: A
     Returns
     -------
     (m,) array
-        0 to 1; 0.5 for edges that are in no triangle.
+        Between 0 and 1; 0.5 for edges without triangles.
     """
     triangles = find_triangles(num_images, edges)
     closes = _close(triangles, edges, cam2_from_cam1_rotations)
@@ -48,11 +48,11 @@ def closing_shares(num_images: int, edges: IntArray, cam2_from_cam1_rotations: A
 def rival_share(
     num_images: int, edges: IntArray, cam2_from_cam1_rotations: Array, weights: Array, agree: BoolArray
 ) -> float:
-    """How far the edges that disagree with a solution agree among themselves.
+    """Consistency among the edges that disagree with a solution.
 
-    Where another solution turns some of the images, the edges from these to the rest are its own, those among these
-    are of both: a triangle of two edges of the first kind and one of the second closes. Edges that are wrong each in
-    its own way close none.
+    Suppose another solution rotates some of the images. Edges between these and the rest agree only with the other
+    solution, edges within each group with both: a triangle of two edges of the first kind and one of the second closes.
+    Edges with independent errors close no triangles.
 
     Parameters
     ----------
@@ -66,14 +66,14 @@ def rival_share(
     Returns
     -------
     float
-        Share that closes of the triangles with one edge that agrees, each weighed by the lightest of its edges; 0 where
-        all edges agree, 1 where less than half of those that disagree are in such a triangle: that tells nothing.
+        Share of the triangles with exactly one agreeing edge that close, weighted by the least weight of their edges. 0
+        if all edges agree; 1 if less than half of the disagreeing edges are in such a triangle, which is inconclusive.
     """
     triangles = find_triangles(num_images, edges)
     triangles = triangles[agree[triangles].sum(axis=1) == 1]
-    asked = np.zeros(len(edges), dtype=bool)
-    asked[triangles] = True
-    if (asked & ~agree).sum() < 0.5 * (~agree).sum():
+    in_triangle = np.zeros(len(edges), dtype=bool)
+    in_triangle[triangles] = True
+    if (in_triangle & ~agree).sum() < 0.5 * (~agree).sum():
         return 1.0
     weight = weights[triangles].min(axis=1, initial=np.inf)
     closed = weight @ _close(triangles, edges, cam2_from_cam1_rotations)
@@ -81,8 +81,8 @@ def rival_share(
 
 
 def _close(triangles: IntArray, edges: IntArray, cam2_from_cam1_rotations: Array) -> BoolArray:
-    """Whether the rotations around each triangle (t, 3) come back to where they started."""
-    # All edges from the lower to the higher row, so that R_uw = R_vw R_uv.
+    """Whether the rotations around each triangle (t, 3) compose to the identity: (t,)."""
+    # Orient all edges from the lower to the higher row, so that R_uw = R_vw R_uv.
     q = quaternions.from_matrices(cam2_from_cam1_rotations)
     q[:3] *= np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
     uv, vw, uw = triangles.T
@@ -91,24 +91,24 @@ def _close(triangles: IntArray, edges: IntArray, cam2_from_cam1_rotations: Array
 
 
 def find_triangles(num_images: int, edges: IntArray) -> IntArray:
-    """All triangles of images u < v < w.
+    """Find all triangles of images u < v < w.
 
     Parameters
     ----------
     num_images : int
     edges : (m, 2) int array
-        Of parallel edges one counts.
+        Only one of several parallel edges is used.
 
     Returns
     -------
     (t, 3) int64 array
-        Their edges u-v, v-w and u-w.
+        Rows of the edges u-v, v-w and u-w of each triangle.
     """
     low, high = edges.min(axis=1), edges.max(axis=1)
     keys, rows = np.unique(low * num_images + high, return_index=True)
     low, high = low[rows], high[rows]
     starts = np.searchsorted(low, np.arange(num_images + 1))
-    # Each edge u-v with each edge that goes up from v.
+    # Combine each edge u-v with each edge v-w, v < w.
     count = np.diff(starts)[high]
     first = np.repeat(np.arange(len(keys)), count)
     second = np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count) + starts[high[first]]

@@ -1,4 +1,4 @@
-"""What all rotation averaging takes and returns: checked edges, weights and relative rotations; the result."""
+"""Input checks and result type shared by all rotation-averaging solvers."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RotationResult:
-    """Absolute rotations and how the averaging ended. The first image's gauge is free: any ``R_i Q`` fits as well.
+    """Absolute rotations with convergence information. They are determined up to a common rotation Q, ``R_i Q``.
 
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
     cost : float
-        The solver's own objective at these rotations.
+        Objective of the solver at these rotations.
     num_iterations : int
     converged : bool
         Whether the step fell below the tolerance before the iteration limit.
@@ -39,15 +39,15 @@ class RotationResult:
 def checked_problem(
     num_images: int, edges: ArrayLike, rotations: ArrayLike, weights: ArrayLike | None
 ) -> tuple[IntArray, Array, Array]:
-    """Edges, relative rotations and weights as arrays, after checking that they determine all rotations.
+    """Convert edges, relative rotations and weights to arrays and check that they determine all rotations.
 
-    Edges of weight zero count as absent.
+    Edges of weight zero are treated as absent.
 
     Raises
     ------
     GraphError
-        Shapes differ, rows lie outside the images or link an image to itself, values are not finite, a weight is
-        negative, or the edges of positive weight leave the graph in several components.
+        Shapes differ, rows are out of range or link an image to itself, values are not finite, a weight is negative, or
+        the edges of positive weight do not connect the graph.
     """
     edges = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
     R = np.asarray(rotations, dtype=np.float64)
@@ -59,7 +59,7 @@ def checked_problem(
     if num_images < 1:
         raise GraphError(f"rotation averaging: needs at least one image, found {num_images}")
     if len(edges) and (edges.min() < 0 or edges.max() >= num_images):
-        raise GraphError(f"rotation averaging: edges hold rows {edges.min()} to {edges.max()} of {num_images} images")
+        raise GraphError(f"rotation averaging: edges have rows {edges.min()} to {edges.max()} of {num_images} images")
     if (edges[:, 0] == edges[:, 1]).any():
         row = int(np.flatnonzero(edges[:, 0] == edges[:, 1])[0])
         raise GraphError(f"rotation averaging: edge {row} links image row {edges[row, 0]} to itself")
@@ -75,13 +75,13 @@ def checked_problem(
         shown = ", ".join(map(str, cut[:5])) + (", ..." if len(cut) > 5 else "")
         raise GraphError(
             f"rotation averaging: the graph is disconnected, {component.max() + 1} components; image rows {shown} "
-            "are not linked to the largest one: solve each component by itself"
+            "are not connected to the largest one: solve each component separately"
         )
     return edges, R, w
 
 
 def checked_initial(num_images: int, initial: ArrayLike | None) -> Array | None:
-    """Initial rotations as an array of its own, or None.
+    """Copy and check initial rotations; None stays None.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The last phase of rotation averaging: precise inside the consensus that was found, and never at its cost."""
+"""Final phase of rotation averaging: refinement by precision that keeps the consensus of edges."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,20 +11,20 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 AGREEMENT_DEG = 5.0
-"""A pair within this of the averaged rotations agrees."""
+"""Largest rotation residual at which an edge agrees with averaged rotations, degrees."""
 MAX_WEIGHT = 10.0
-"""Likelihood of one edge, over the median edge's, that counts at most: no single pair outvotes a group."""
+"""Upper limit of an edge's likelihood over the median, dimensionless, so that no single edge outvotes a group."""
 MAX_LOSS = 0.002
-"""Of the consensus, that refining may cost: a few pairs at the very bound of agreement."""
+"""Largest share of the consensus that refinement may lose: a few edges at the threshold of agreement."""
 
 
 def capped_likelihoods(likelihoods: Array) -> Array:
-    """Likelihoods over their median, up to `MAX_WEIGHT`."""
+    """Likelihoods divided by their median, at most `MAX_WEIGHT`."""
     return np.asarray(np.minimum(likelihoods / np.median(likelihoods), MAX_WEIGHT))
 
 
 def consensus_of(edges: IntArray, cam2_from_cam1_rotations: Array, capped: Array, rotations: Array) -> float:
-    """Share of the edges' weight (m,) that agrees with cam_from_world rotations (n, 3, 3)."""
+    """Share of the edges' weights `capped` (m,) that agrees with cam_from_world rotations (n, 3, 3)."""
     agree = rotation_residuals(edges, cam2_from_cam1_rotations, rotations) <= np.radians(AGREEMENT_DEG)
     return float(capped @ agree / capped.sum())
 
@@ -37,34 +37,35 @@ def refine_rotations(
     weights: Array,
     rotations: Array,
 ) -> tuple[Array, tuple[LogEntry, ...]]:
-    """Average again by precision, from given rotations and by the edges that agree with them.
+    """Refine rotations by precision-weighted averaging over the edges that agree with them.
 
-    The scale of the loss adapts to the noise; where that tears the consensus apart (a focal length that is a little off
-    opens rings of images), it stays at `AGREEMENT_DEG`, and where that does, too, the rotations stay.
+    The scale of the loss adapts to the noise. If that loses consensus (a slightly wrong focal length opens rings of
+    images), the scale is fixed at `AGREEMENT_DEG`; if that loses consensus, too, the rotations are returned unchanged.
 
     Parameters
     ----------
     num_images : int
     edges : (m, 2) int array
-        Of a connected graph.
+        The graph must be connected.
     cam2_from_cam1_rotations : (m, 3, 3) array
     likelihoods : (m,) array
-        Evidence that edges are right: what the consensus is counted by.
+        Evidence that each edge is correct, by which the consensus is weighted.
     weights : (m,) array
         Precisions of the edges' rotations.
     rotations : (n, 3, 3) array
-        cam_from_world.
+        Initial cam_from_world rotations.
 
     Returns
     -------
     rotations : (n, 3, 3) array
+        cam_from_world rotations.
     log : tuple of LogEntry
-        Of the last averaging.
+        Log of the last averaging.
     """
     capped = capped_likelihoods(likelihoods)
     least = consensus_of(edges, cam2_from_cam1_rotations, capped, rotations) - MAX_LOSS
     residuals = rotation_residuals(edges, cam2_from_cam1_rotations, rotations)
-    # The others keep just enough to leave nothing unconnected.
+    # The other edges keep a negligible weight so that the graph stays connected.
     inside = np.where(residuals <= np.radians(2.0 * AGREEMENT_DEG), weights, 1e-6 * np.median(weights))
     for adapt_sigma in (True, False):
         result = average_rotations_robust(

@@ -1,8 +1,9 @@
-"""Robust rotation averaging: spanning tree, L1, then Geman-McClure, all by reweighted least squares.
+"""Robust rotation averaging by iteratively reweighted least squares: spanning tree, L1, then Geman-McClure.
 
-Chatterjee & Govindu, "Robust Relative Rotation Averaging" (PAMI 2018). In the tangent space of the world,
-``R_i <- R_i exp(x_i)``, an edge's residual ``r_ij = log(R_j^T R_ij R_i)`` is lowered by ``x_j - x_i``, the same for all
-three axes. Each reweighted step is therefore one scalar graph Laplacian with three right-hand sides.
+Chatterjee & Govindu, "Robust Relative Rotation Averaging" (PAMI 2018). With updates in the world frame,
+``R_i <- R_i exp(x_i)``, the residual ``r_ij = log(R_j^T R_ij R_i)`` of an edge changes by ``-(x_j - x_i)``, with the
+same coefficients for all three axes. Each reweighted step therefore solves one scalar graph Laplacian with three
+right-hand sides.
 """
 
 from collections.abc import Callable
@@ -21,16 +22,17 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 L1_FLOOR = np.radians(0.5)
-"""Residuals below this count as this in the L1 weights 1/r: the noise of good edges, whose order means nothing."""
+"""Lower limit of residuals in the L1 weights 1/r, radians: the noise level of good edges."""
 SIGMA_PER_QUARTILE = 2.3
-"""Final Geman-McClure scale over the residuals' lower quartile. For isotropic normal noise the quartile is 1.1 standard
-deviations of an axis, so the loss turns at 2.5. A quartile, because up to half of real edges are outliers."""
+"""Final Geman-McClure scale over the lower quartile of the residuals, dimensionless. For isotropic normal noise the
+quartile is 1.1 standard deviations of an axis, so the scale is 2.5 of them. A quartile, because up to half of real
+edges are outliers."""
 MIN_SIGMA = np.radians(0.1)
-"""Least scale of the last phase; noise-free graphs would have none."""
+"""Lower limit of the scale in the last phase, radians; it would vanish on noise-free graphs."""
 L1_TOLERANCE = 3e-3
-"""Step in radians at which L1 gives way to Geman-McClure. Stopped earlier, the end depends on the tree."""
+"""Step at which the L1 phase ends, radians. With an earlier stop the result depends on the spanning tree."""
 FIRST_TOLERANCE = 1e-3
-"""Step in radians at which the scale is adapted; COLMAP's last tolerance."""
+"""Step at which the scale is adapted, radians; COLMAP's last tolerance."""
 
 
 def average_rotations_robust(
@@ -46,7 +48,7 @@ def average_rotations_robust(
     max_num_iterations: int = 100,
     tolerance: float = 1e-4,
 ) -> RotationResult:
-    """Rotations that minimise ``sum w_ij rho(r_ij)``, ``rho(r) = r^2 / (1 + r^2 / sigma^2)`` (Geman-McClure).
+    """Average rotations by minimising ``sum w_ij rho(r_ij)``, ``rho(r) = r^2 / (1 + r^2 / sigma^2)`` (Geman-McClure).
 
     Parameters
     ----------
@@ -55,16 +57,17 @@ def average_rotations_robust(
     cam2_from_cam1_rotations : (m, 3, 3) array
         ``R_ij = R_j R_i^T`` for cam_from_world rotations R.
     weights : (m,) array, optional
-        Multipliers of the loss; they also choose the spanning tree. Default: all one.
+        Multipliers of the loss, and edge weights of the spanning tree. Default: all one.
     initial : (n, 3, 3) array, optional
-        Start in place of the spanning tree.
+        Initial cam_from_world rotations. Default: those of the maximum spanning tree.
     sigma_deg : float
         Scale of the Geman-McClure loss, degrees; COLMAP's default.
     adapt_sigma : bool
-        End with a smaller scale, 2.3 times the lower quartile of the residuals, where that is below `sigma_deg`.
+        Whether to end with a smaller scale, 2.3 times the lower quartile of the residuals, if it is below `sigma_deg`.
     max_num_l1_iterations, max_num_iterations : int
-        Limits of the L1 phase and of each Geman-McClure phase. The L1 phase pulls long chains straight that a poor
-        start has bent, and leaves a good start where half of the edges are false: 0 skips it.
+        Maximum number of iterations of the L1 phase and of each Geman-McClure phase. The L1 phase corrects the drift of
+        long chains after a poor initialisation, but moves away from a good one if half of the edges are false: 0 skips
+        it.
     tolerance : float
         Root mean square step of the images at which a Geman-McClure phase ends, radians.
 
@@ -98,7 +101,7 @@ def average_rotations_robust(
 
 
 Loss = Callable[[Array], tuple[Array, Array]]
-"""Residuals (m,) in radians to weights (m,) and losses (m,)."""
+"""Function of residuals (m,) in radians that returns weights (m,) and losses (m,)."""
 
 
 def _l1(r: Array) -> tuple[Array, Array]:
@@ -114,7 +117,7 @@ def _geman_mcclure(sigma: float) -> Loss:
 
 
 class _Reweighting:
-    """Absolute rotations under iteratively reweighted tangent-space steps."""
+    """State of the iteratively reweighted least squares on absolute rotations."""
 
     def __init__(self, num_images: int, edges: IntArray, relative: Array, weights: Array, start: Array) -> None:
         self.log: list[LogEntry] = []
@@ -125,7 +128,7 @@ class _Reweighting:
         self._residuals, self.angles = self._measure()
 
     def run(self, loss: Loss, max_num_iterations: int, tolerance: float) -> bool:
-        """Iterate until the root mean square step is below the tolerance; whether it was reached."""
+        """Iterate until the root mean square step is below the tolerance; return whether it was reached."""
         for _ in range(max_num_iterations):
             self.step(loss, relative_tolerance=1e-2)
             if self.log[-1].change <= tolerance:
@@ -133,7 +136,7 @@ class _Reweighting:
         return False
 
     def step(self, loss: Loss, relative_tolerance: float) -> float:
-        """One reweighted least-squares step, its system solved to the given accuracy; the cost after it."""
+        """Take one reweighted least-squares step, solved to a relative accuracy; return the cost after it."""
         w = self._weights * loss(self.angles)[0]
         x = self._laplacian.solve(w, self._laplacian.divergence(w * self._residuals), relative_tolerance)
         self.absolute = quaternions.multiply(self.absolute, quaternions.exp(x.T))
@@ -143,7 +146,7 @@ class _Reweighting:
         return cost
 
     def _measure(self) -> tuple[Array, Array]:
-        """log(R_j^T R_ij R_i) as vectors (3, m) and angles (m,)."""
+        """Residuals ``log(R_j^T R_ij R_i)`` as vectors (3, m) and angles (m,), radians."""
         q = self.absolute
         at_second = quaternions.multiply(quaternions.conjugate(q)[:, self._j], self._relative)
         return quaternions.log(quaternions.multiply(at_second, q[:, self._i]))

@@ -18,10 +18,10 @@ def rotations_from_spanning_tree(
     cam2_from_cam1_rotations: ArrayLike,
     weights: ArrayLike | None = None,
 ) -> Array:
-    """Chain relative rotations along the spanning tree of largest total weight.
+    """Chain relative rotations along the maximum-weight spanning tree.
 
-    The root, the image with most edges, gets the identity. Among equal weights, edges between images with many edges
-    are taken first, which keeps the tree shallow.
+    The root is the image with most edges; its rotation is the identity. Among equal weights, edges between images with
+    many edges are preferred, which keeps the tree shallow.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def rotations_from_spanning_tree(
     edges : (m, 2) int array
     cam2_from_cam1_rotations : (m, 3, 3) array
     weights : (m,) array, optional
-        Default: all one. Edges of weight zero are left out.
+        Default: all one. Edges of weight zero are ignored.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def rotations_from_spanning_tree(
     forward = edges[e, 1] == rows  # the edge leads from the parent to this image
     chained = np.tile(np.eye(3), (num_images, 1, 1))
     chained[rows] = np.where(forward[:, None, None], relative[e], np.swapaxes(relative[e], 1, 2))
-    # R_i = T_i R_parent(i). Jumping over parents doubles the reach each time: log2(depth) rounds, whatever the tree.
+    # R_i = T_i R_parent(i). Pointer jumping doubles the length of the chains each time: log2(depth) rounds.
     while (parents != root).any():
         chained = chained @ chained[parents]
         parents = parents[parents]
@@ -63,12 +63,12 @@ def spanning_tree(num_images: int, edges: IntArray, weights: Array) -> tuple[Int
     num_images : int
     edges : (m, 2) int64 array
     weights : (m,) array
-        Edges of weight zero are left out.
+        Edges of weight zero are ignored.
 
     Returns
     -------
     parents : (n,) int64 array
-        Parent of each image; the root's is itself.
+        Parent of each image; the root is its own parent.
     parent_edges : (n,) int64 array
         Edge to the parent; -1 at the root.
     root : int
@@ -77,11 +77,11 @@ def spanning_tree(num_images: int, edges: IntArray, weights: Array) -> tuple[Int
     degree = np.bincount(edges.ravel(), minlength=num_images)
     usable = np.flatnonzero(weights > 0)
     ends = np.sort(edges[usable], axis=1)
-    # Ranks instead of weights: csgraph takes zeros for absent edges, and ties want an order of their own.
+    # Use ranks instead of weights: csgraph treats zeros as absent edges, and ties need a defined order.
     order = np.lexsort((usable, -degree[ends].min(axis=1), -weights[usable]))
     rank = np.empty(len(usable))
     rank[order] = np.arange(1.0, len(usable) + 1.0)
-    # Of parallel edges only the best may stay, since sparse matrices would sum them.
+    # Keep only the best of parallel edges, since sparse matrices would sum them.
     keys = ends[:, 0] * num_images + ends[:, 1]
     by_key = order[np.argsort(keys[order], kind="stable")]
     unique_keys, first = np.unique(keys[by_key], return_index=True)

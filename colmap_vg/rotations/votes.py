@@ -1,8 +1,8 @@
-"""Absolute rotations by votes: clusters of images merge where the edges between them agree best on how.
+"""Initial absolute rotations by agglomerative clustering, where the edges between clusters vote on their alignment.
 
-A spanning tree believes every edge that it takes. Here an edge decides alone only while nothing else links its images:
-all edges between two clusters vote on the turn that joins them, and the two whose vote has the largest lead merge
-first. A false edge, however strong, is outvoted once clusters have formed.
+A spanning tree depends on every one of its edges. Here all edges between two clusters of images vote on the rotation
+that aligns them, and the pair of clusters whose vote has the largest lead is merged first. An edge decides alone only
+if no other edge connects its clusters, so a false edge, however strong, is outvoted once clusters have formed.
 """
 
 import numpy as np
@@ -15,12 +15,12 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-POLLED_AT_ONCE = 16
-"""Votes that are taken together: array operations on one alone are mostly overhead."""
+VOTES_PER_BATCH = 16
+"""Number of votes counted together, since array operations on a single one are mostly overhead."""
 AGREEMENT_DEG = 8.0
-"""Turns this close agree: the noise of weak pairs, and the drift that clusters have gathered."""
+"""Largest angle between two rotations that agree, degrees: noise of weak pairs plus drift inside clusters."""
 NUM_HYPOTHESES = 12
-"""Edges between two clusters whose turns are put to the vote, the heaviest."""
+"""Number of edges between two clusters, the heaviest, whose rotations are hypotheses of the vote."""
 
 
 def rotations_by_votes(
@@ -29,7 +29,7 @@ def rotations_by_votes(
     cam2_from_cam1_rotations: ArrayLike,
     weights: ArrayLike | None = None,
 ) -> Array:
-    """Rotations of clusters that merged by weighted majority until one was left.
+    """Rotations from merging clusters of images by weighted majority votes until one cluster is left.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def rotations_by_votes(
     edges : (m, 2) int array
     cam2_from_cam1_rotations : (m, 3, 3) array
     weights : (m,) array, optional
-        Votes of each edge. Default: one. Edges of weight zero have none.
+        Weight of each edge's vote. Default: all one. Edges of weight zero are ignored.
 
     Returns
     -------
@@ -60,9 +60,9 @@ def rotations_by_votes(
 
 
 class _Clusters:
-    """Images in clusters with a frame each, and the standing vote between any two that edges link.
+    """Clusters of images, each with a frame of its own, and a vote for every two clusters that edges connect.
 
-    Votes are taken anew only when they come first by an upper bound of their lead: most never are.
+    Votes are counted lazily: a stale one has an upper bound of its lead and is recounted only when that is the largest.
     """
 
     def __init__(self, num_images: int, edges: IntArray, relative: Array, weights: Array) -> None:
@@ -80,17 +80,17 @@ class _Clusters:
         self._vote_with: list[dict[int, int]] = [{} for _ in range(num_images)]
         for vote, (a, b) in enumerate(self._clusters_of):
             self._vote_with[a][b] = self._vote_with[b][a] = vote
-        # Upper bounds where a vote is not fresh.
+        # Leads of votes; upper bounds where a vote is not fresh.
         self._lead = np.bincount(row, weights)
         self._fresh = np.zeros(len(pairs), dtype=bool)
         self._turn = np.zeros((4, len(pairs)))
-        self._poll(np.arange(len(pairs)))
+        self._count(np.arange(len(pairs)))
 
     def merge_best(self) -> None:
         """Merge the two clusters whose vote has the largest lead."""
         best = int(np.argmax(self._lead))
         while not self._fresh[best]:
-            self._poll(self._foremost(best))
+            self._count(self._votes_to_recount(best))
             best = int(np.argmax(self._lead))
         into, moved = self._clusters_of[best]
         turn = self._turn[:, best : best + 1]
@@ -115,23 +115,23 @@ class _Clusters:
                 self._lead[vote] = -np.inf
             self._fresh[standing] = False
 
-    def _foremost(self, best: int) -> IntArray:
-        """Votes to be taken anew: the best, and others that are not fresh and may lead by as much as it does."""
-        if len(self._lead) <= POLLED_AT_ONCE:
+    def _votes_to_recount(self, best: int) -> IntArray:
+        """Votes to recount: the best, and stale ones whose bounds are more than half of its bound."""
+        if len(self._lead) <= VOTES_PER_BATCH:
             return np.flatnonzero(~self._fresh & np.isfinite(self._lead))
-        near = np.argpartition(-self._lead, POLLED_AT_ONCE)[:POLLED_AT_ONCE]
+        near = np.argpartition(-self._lead, VOTES_PER_BATCH)[:VOTES_PER_BATCH]
         near = near[~self._fresh[near] & (self._lead[near] > 0.5 * self._lead[best])]
         return np.union1d(near, best)
 
-    def _poll(self, votes: IntArray) -> None:
-        """Take votes anew."""
+    def _count(self, votes: IntArray) -> None:
+        """Recount votes."""
         voters = [self._voters[vote] for vote in votes]
         sizes = np.array([len(v) for v in voters])
         rows = np.array([row for v in voters for row in v], dtype=np.int64)
         run = np.repeat(np.arange(len(votes)), sizes)
         rows = rows[np.lexsort((rows, -self._weights[rows], run))]
         i, j, w = self._i[rows], self._j[rows], self._weights[rows]
-        # R_ij = R_j Q R_i^T where Q turns the second image's cluster; the first image's turns by the inverse.
+        # R_ij = R_j Q R_i^T, where Q rotates the cluster of the second image; that of the first rotates by the inverse.
         q = self.absolute
         turn = quaternions.multiply(
             quaternions.conjugate(q[:, j]), quaternions.multiply(self._relative[:, rows], q[:, i])
@@ -144,25 +144,25 @@ class _Clusters:
 
 
 def count_votes(turn: Array, weights: Array, sizes: IntArray) -> tuple[Array, Array, Array]:
-    """Turns that most weight wants, in runs of votes.
+    """Find the rotations of largest total weight in runs of votes.
 
     Parameters
     ----------
     turn : (4, m) array
-        Quaternions voted for. The first ones of each run, its heaviest, are the hypotheses.
+        Quaternions voted for. The first ones of each run, which have the largest weights, are the hypotheses.
     weights : (m,) array
     sizes : (k,) int array
-        Votes of each run.
+        Number of votes of each run.
 
     Returns
     -------
     winner : (4, k) array
-        Mean of the turns that agree with the winning hypothesis.
+        Mean of the quaternions that agree with the winning hypothesis.
     support, rival : (k,) array
-        Weight that agrees with the winner, and with the strongest hypothesis that does not.
+        Total weight of the votes for the winner, and for the strongest hypothesis that disagrees with it.
     """
     starts, run = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
-    # Short runs put their last edge's turn more than once, which changes nothing.
+    # Short runs repeat their last hypothesis, which does not change the result.
     put = np.minimum(np.arange(min(NUM_HYPOTHESES, int(sizes.max()))), sizes[:, None] - 1) + starts[:, None]
     hypotheses = turn[:, put]
     agree = agree_within(turn[:, :, None], hypotheses[:, run])
@@ -179,6 +179,6 @@ def count_votes(turn: Array, weights: Array, sizes: IntArray) -> tuple[Array, Ar
 
 
 def agree_within(one: Array, other: Array) -> BoolArray:
-    """Whether rotations, quaternions along the first axis, are within `AGREEMENT_DEG` of each other."""
+    """Whether rotations, given as quaternions along the first axis, differ by less than `AGREEMENT_DEG`."""
     cosine = one[0] * other[0] + one[1] * other[1] + one[2] * other[2] + one[3] * other[3]
     return np.asarray(np.abs(cosine) > np.cos(np.radians(0.5 * AGREEMENT_DEG)))

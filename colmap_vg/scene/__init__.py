@@ -1,1 +1,1 @@
-"""What is solved, and what comes out: viewing graphs, their parts, solutions, verdicts."""
+"""Data types: viewing graphs, their parts, solutions, and verdicts."""

@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 
 
 def components_by_size(num_nodes: int, edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Component of each node, 0 for the largest; ties go to the one with the lowest node.
+    """Connected component of each node, 0 for the largest; ties go to the one with the lowest node.
 
     Parameters
     ----------

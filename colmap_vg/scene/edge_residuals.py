@@ -1,4 +1,4 @@
-"""How far the relative poses of edges are from solved cameras, in radians and in their own standard deviations."""
+"""Residuals of the relative poses of edges at solved cameras, in radians and in standard deviations."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ def edge_residual_sigmas(
     cam_from_world_rotations: Array,
     projection_centers: Array,
 ) -> Array:
-    """Root mean square of the five residuals of each edge, whitened by its information.
+    """Root mean square of the five residuals of each edge's relative pose, whitened by its information.
 
     Parameters
     ----------
@@ -47,14 +47,14 @@ def edge_residual_sigmas(
     cam2_in_cam1_directions : (m, 3) array
         Unit vectors.
     information : (m, 5, 5) array
-        As `ViewGraph.edge_information`.
+        Inverse covariances, as in `ViewGraph.edge_information`.
     cam_from_world_rotations : (n, 3, 3) array
     projection_centers : (n, 3) array
 
     Returns
     -------
     (m,) array
-        About 1 under the noise of the edge's own matches; more where the camera model is not exact.
+        About 1 if the noise of the edge's matches is the only error; more if the camera model is not exact.
     """
     i, j = edges.T
     R, p = cam_from_world_rotations, projection_centers
@@ -69,21 +69,22 @@ def edge_residual_sigmas(
 
 
 def graph_residual_sigmas(graph: ViewGraph, rotations: Array, centers: Array, component: IntArray) -> Array | None:
-    """Residuals of all edges of a graph against poses, as :func:`edge_residual_sigmas` has them.
+    """Residuals of all edges of a graph at solved poses, computed by :func:`edge_residual_sigmas`.
 
     Parameters
     ----------
     graph : ViewGraph
     rotations : (n, 3, 3) array
-        cam_from_world.
+        cam_from_world rotations.
     centers : (n, 3) array
+        Projection centres, frame of their component.
     component : (n,) int array
-        Images of one frame have one number; -1 is none.
+        Number of each image's frame; -1 if unsolved.
 
     Returns
     -------
     (m,) array or None
-        NaN for edges between frames and those without a direction; None for graphs without information.
+        NaN for edges between frames and for those without a direction; None for graphs without information.
     """
     if graph.edge_information is None:
         return None

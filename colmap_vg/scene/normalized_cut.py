@@ -1,4 +1,4 @@
-"""Where a graph is cut most easily: the normalized cut of Shi & Malik (PAMI 2000), by sweeping the Fiedler vector."""
+"""Normalized cut of a graph (Shi & Malik, PAMI 2000), by sweeping the Fiedler vector."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,11 +10,11 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 DENSE_BELOW = 400
-"""Nodes; below, all eigenvectors take less time than a few of them."""
+"""Number of nodes below which computing all eigenvectors is faster than computing a few of them."""
 
 
 def normalized_cut(num_nodes: int, edges: IntArray, weights: Array, min_nodes: int = 1) -> tuple[BoolArray, float]:
-    """Split a connected graph in two where it is held together least.
+    """Split a connected graph in two at the cut of least conductance.
 
     Parameters
     ----------
@@ -24,14 +24,14 @@ def normalized_cut(num_nodes: int, edges: IntArray, weights: Array, min_nodes: i
     weights : (m,) array
         Positive.
     min_nodes : int
-        Of either side.
+        Minimum number of nodes of either side.
 
     Returns
     -------
     side : (n,) bool array
-        The smaller side.
+        Mask of the smaller side.
     conductance : float
-        Weight of the edges between the sides over the smaller sum of degrees of a side.
+        Total weight of the cut edges over the smaller sum of degrees of the two sides.
 
     Examples
     --------
@@ -45,7 +45,7 @@ def normalized_cut(num_nodes: int, edges: IntArray, weights: Array, min_nodes: i
     order = np.argsort(_fiedler_vector(num_nodes, edges, weights, degree), kind="stable")
     place = np.empty(num_nodes, dtype=np.int64)
     place[order] = np.arange(num_nodes)
-    # An edge is cut by the sweep from behind its first end to before its second.
+    # The sweep cuts an edge from after its first end to before its second.
     low, high = np.minimum(place[i], place[j]), np.maximum(place[i], place[j])
     starts = np.bincount(low + 1, weights, num_nodes + 1)
     cut = np.cumsum(starts - np.bincount(high + 1, weights, num_nodes + 1))[1:num_nodes]
@@ -59,7 +59,7 @@ def normalized_cut(num_nodes: int, edges: IntArray, weights: Array, min_nodes: i
 
 
 def _fiedler_vector(num_nodes: int, edges: IntArray, weights: Array, degree: Array) -> Array:
-    """Eigenvector of the second smallest eigenvalue of the normalized Laplacian, over the roots of degrees: (n,)."""
+    """Eigenvector of the second smallest eigenvalue of the normalized Laplacian, over the square roots of degrees."""
     i, j = edges.T
     root = np.sqrt(degree)
     between = weights / (root[i] * root[j])
@@ -69,7 +69,7 @@ def _fiedler_vector(num_nodes: int, edges: IntArray, weights: Array, degree: Arr
     )
     if num_nodes < DENSE_BELOW:
         return np.asarray(np.linalg.eigh(A.toarray())[1][:, -2] / root)
-    # The largest eigenvalue is 1, its vector the roots; the start is fixed so that results are.
+    # The largest eigenvalue is 1, with the roots as eigenvector. A fixed start makes results reproducible.
     start = np.random.default_rng(0).standard_normal(num_nodes)
     values, vectors = spla.eigsh(A, k=2, which="LA", v0=start, tol=1e-6)
     return np.asarray(vectors[:, int(np.argmin(values))] / root)

@@ -1,4 +1,4 @@
-"""What a viewing-graph solve returns: poses, and a verdict for every image and edge."""
+"""Result of a viewing-graph solve: poses, and a verdict for every image and edge."""
 
 from dataclasses import dataclass, field
 
@@ -17,12 +17,12 @@ class LogEntry:
     Attributes
     ----------
     stage : str
-        The solver that wrote it: ``rotations``, ``cls``, ``2O``, ``epipolar``, ...
+        Name of the solver: ``rotations``, ``cls``, ``2O``, ``epipolar``, ...
     iteration : int
     cost : float
-        The stage's own objective.
+        Objective of the stage.
     change : float
-        Relative change on which the stage's convergence is judged.
+        Quantity on which the stage's convergence is judged, such as a relative change.
     """
 
     stage: str
@@ -42,10 +42,10 @@ class Agreement:
     pairs : float
         Share of the pairs within 5 degrees in rotation.
     directions : float
-        Share of the inlier matches that are in pairs whose direction is within three standard deviations; a degree for
-        what the lens model leaves is in them.
+        Share of the inlier matches that are in pairs whose direction is within three standard deviations, which include
+        one degree for unmodelled distortion.
     num_pairs : int
-        Pairs between images of the component that have a rotation of their own.
+        Number of pairs between images of the component with a relative rotation.
     """
 
     inliers: float
@@ -56,9 +56,9 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """Poses of all images of a graph, in the graph's order; rows of unsolved images hold NaN.
+    """Poses of all images of a graph, in the graph's order; rows of unsolved images are NaN.
 
-    Images that nothing links firmly are solved in several components, each in a frame of its own.
+    Parts that are not reliably linked are solved as several components, each in its own frame.
 
     Attributes
     ----------
@@ -67,42 +67,45 @@ class PoseSolution:
     projection_centers : (n, 3) array
         Camera centres in the component's frame; centroid 0, root mean square distance 1 over its images.
     registered : (n,) bool array
-        Images of component 0, the largest: those that share a frame with most others.
+        Images of component 0, the largest.
     component : (n,) int64 array
-        Component each image belongs to, numbered by size; -1 where unsolved.
+        Component of each image, numbered by decreasing size; -1 if unsolved.
     focal_scales : (c,) array
         Factor on each camera's focal length in the graph.
     radial_terms : (c,) array or None
-        Radial term found for each camera, as in COLMAP's polynomials and at the focal length found, on top of what
-        the camera had. None where none was worth having.
+        Radial term estimated for each camera, as in COLMAP's polynomials and at the estimated focal length, in addition
+        to the camera's distortion. None if none was estimated.
     position_covariances : (n, 3, 3) array or None
-        Of the centres, in their component's frame and unit after the best similarity; where asked for.
+        Covariances of the centres, in their component's frame and squared unit after the best similarity; only if
+        requested.
     rotation_covariances : (n, 3, 3) array or None
-        Of small turns w of each camera in its own frame, ``R <- exp(w) R``, squared radians; where asked for.
+        Covariances of small rotations w of each camera in its own frame, ``R <- exp(w) R``, squared radians; only if
+        requested.
     edge_residual_sigmas : (m,) array or None
-        Root mean square of the whitened differences of each edge's relative pose from the solution's, about 1 under
-        the noise of its matches alone; NaN where the edge has no information or its images share no component.
+        Root mean square of the whitened differences of each edge's relative pose from the solution's; about 1 if the
+        noise of its matches is the only error. NaN if the edge has no information or its images no common component.
     edge_kept : (m,) bool array
+        Edges that were used in the solution.
     edge_verdicts : (m,) str array
         `EdgeVerdict` words.
     image_verdicts : (n,) str array
         `ImageVerdict` words.
     status : SolutionStatus
     message : str
-        A sentence that says what happened and what to do.
+        Sentences that say what happened and what to do.
     converged : bool
         Whether no iteration limit was reached.
     caveats : tuple of str
-        Sentences on what could not be had in full.
+        Sentences on limitations of the solution.
     agreement : tuple of Agreement
-        Of each component with its pairs.
+        Agreement of each component with its pairs.
     in_doubt : (n,) bool array or None
-        Images that another arrangement, with which nearly as many matches agree, places otherwise; None without one.
+        Images whose pose differs in another arrangement that nearly as many matches agree with; None without one.
     arrangements : tuple of (n, 3, 3) arrays
-        cam_from_world rotations, as averaged, of the arrangement that was solved and of others worth a look: that one,
-        and the one that each image's strongest pairs make. NaN outside the part that they arrange. Empty where there
-        are no others.
+        Averaged cam_from_world rotations of the solved arrangement and of alternatives: the one above, and the one from
+        each image's strongest pairs. NaN outside the part concerned. Empty without alternatives.
     log : tuple of LogEntry
+        One entry per iteration of each stage.
     """
 
     image_ids: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""Part of a viewing graph, with its images renumbered."""
+"""Parts of a viewing graph with renumbered images."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Subgraph:
-    """Some images and edges of a graph.
+    """Subset of the images and edges of a graph.
 
     Attributes
     ----------
     images : (k,) int64 array
-        Rows of the graph's images, rising.
+        Rows of the graph's images, in increasing order.
     edge_rows : (e,) int64 array
-        Rows of the graph's edges, rising.
+        Rows of the graph's edges, in increasing order.
     edges : (e, 2) int64 array
         Rows into `images`.
     """
@@ -29,7 +29,7 @@ class Subgraph:
 
     @classmethod
     def of(cls, edges: IntArray, images: BoolArray, kept: BoolArray) -> "Subgraph":
-        """The images marked (n,) and, of the edges marked (m,), those between them; `edges` is the graph's (m, 2)."""
+        """Subgraph of the images of a mask (n,) and those edges (m, 2) of a mask `kept` (m,) that are between them."""
         rows = np.flatnonzero(images)
         local = np.full(len(images), -1, dtype=np.int64)
         local[rows] = np.arange(len(rows))
@@ -37,7 +37,7 @@ class Subgraph:
         return cls(rows, inside, local[edges[inside]])
 
     def with_edges(self, kept: BoolArray) -> "Subgraph":
-        """The same images, and those of its edges that are marked (e,)."""
+        """Subgraph with the same images and the edges of a mask (e,)."""
         return Subgraph(self.images, self.edge_rows[kept], self.edges[kept])
 
     @property
@@ -46,5 +46,5 @@ class Subgraph:
         return len(self.images)
 
     def rows_of(self, images: IntArray) -> IntArray:
-        """Rows in this part of some of its images, given by their rows in the graph."""
+        """Rows in this part of images given by their rows in the graph."""
         return np.searchsorted(self.images, images)

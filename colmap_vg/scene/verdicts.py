@@ -1,16 +1,16 @@
-"""The words in which verdicts on edges, images and whole solutions are given, each with its reason."""
+"""Verdicts on edges, images and whole solutions, each with its reason."""
 
 from enum import StrEnum
 from typing import Self
 
 
 class Verdict(StrEnum):
-    """A word and, as `reason`, the clause that says what it means."""
+    """A word with its meaning as the clause `reason`."""
 
     reason: str
 
     def __new__(cls, word: str, reason: str) -> Self:
-        """Make a member that equals its word."""
+        """Create a member that equals its word."""
         member = str.__new__(cls, word)
         member._value_ = word
         member.reason = reason
@@ -18,12 +18,12 @@ class Verdict(StrEnum):
 
 
 class EdgeVerdict(Verdict):
-    """Why an edge (a verified image pair) was kept or left out."""
+    """Whether an edge (a verified image pair) was used, or why not."""
 
     KEPT = "kept", "rotation and direction were used"
     ROTATION_ONLY = (
         "rotation_only",
-        "used for rotations; its direction says nothing (panoramic pair, vanishing baseline)",
+        "used for rotations; its direction is undetermined (panoramic pair, vanishing baseline)",
     )
     NO_POSE = "no_pose", "no relative pose explains its matches"
     DEGENERATE = "degenerate", "COLMAP found no geometry that explains the matches"
@@ -42,14 +42,14 @@ class EdgeVerdict(Verdict):
         "its relative pose is ten times as far from the solved one as that of other pairs, in standard deviations",
     )
     REVERSED = "reversed", "its direction points away from the solved one"
-    OUTSIDE = "outside_component", "it lies outside what was solved, or links two models"
+    OUTSIDE = "outside_component", "it is outside the solved part, or links two models"
 
 
 class ImageVerdict(Verdict):
-    """Why an image was registered or left out."""
+    """Whether an image was registered, or why not."""
 
     REGISTERED = "registered", "it is in the largest model"
-    OTHER_MODEL = "other_model", "it is in a smaller model, in a frame of its own; nothing that holds links the two"
+    OTHER_MODEL = "other_model", "it is in a smaller model with its own frame; no reliable pairs link the two"
     NO_EDGES = "no_edges", "no verified pair of this image could be used"
     SMALLER_COMPONENT = (
         "smaller_component",
@@ -60,11 +60,11 @@ class ImageVerdict(Verdict):
         "not_rigid",
         "neither the directions of its pairs nor tracks through three images fix its position relative to the others",
     )
-    UNCERTAIN = "uncertain", "its pairs fix its position to worse than a tenth of the scene's radius"
-    MISPLACED = "misplaced", "points would place it where its pairs' relative poses contradict that"
+    UNCERTAIN = "uncertain", "its pairs determine its position to worse than a tenth of the scene's radius"
+    MISPLACED = "misplaced", "its pose from triangulated points contradicts the relative poses of its pairs"
     FEW_OBSERVATIONS = (
         "few_observations",
-        "too few triangulated points that three images see at an angle are seen in it",
+        "it observes too few triangulated points that three images see at a sufficient angle",
     )
 
 
@@ -79,4 +79,4 @@ class SolutionStatus(StrEnum):
     NOT_CONVERGED = "not_converged"
     """The iteration limit was reached; the poses are the best found."""
     UNSOLVABLE = "unsolvable"
-    """Nothing could be solved: no usable edges, or no three images that fix each other."""
+    """Nothing could be solved: no usable edges, or no three images whose positions are determined."""

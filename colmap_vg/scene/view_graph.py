@@ -1,6 +1,6 @@
 """The viewing graph: images as nodes, verified pairs as edges with relative poses.
 
-Conventions, written down once. World to camera is ``x_cam = R x_world + t`` (COLMAP's ``cam_from_world``).
+World to camera is ``x_cam = R x_world + t`` (COLMAP's ``cam_from_world``). Correspondence with the paper's notation:
 
 ===================================================  ==========================================================
 paper (Nasiri et al.)                                here
@@ -30,12 +30,12 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
-    """All images and verified pairs of a scene, unusable ones too. Arrays are read-only by convention.
+    """All images and verified pairs of a scene, including unusable ones. Arrays are read-only by convention.
 
     Attributes
     ----------
     image_ids : (n,) int64 array
-        Unique ids, the database's.
+        Unique image ids of the database.
     edges : (m, 2) int64 array
         Rows into `image_ids`, two different ones per edge.
     cam2_from_cam1_rotations : (m, 3, 3) array
@@ -43,30 +43,30 @@ class ViewGraph:
     cam2_in_cam1_directions : (m, 3) array
         Unit vectors from camera 1 towards camera 2, in camera 1's frame.
     num_inliers : (m,) int64 array or None
-        Verified matches of each edge.
+        Number of verified matches of each edge.
     camera_idx : (n,) int64 array or None
         Row of each image's camera in the per-camera arrays.
     image_names : tuple of str
         Names in the order of `image_ids`; empty when unknown.
     camera_ids : (c,) int64 array or None
-        The database's camera ids.
+        Camera ids of the database.
     camera_focal_lengths : (c,) array or None
-        Mean focal length in pixels under which bearings and relative poses were taken.
+        Mean focal length, pixels, with which bearings and relative poses were computed.
     camera_focal_known : (c,) bool array or None
-        Whether that focal length was given (calibrated, or from EXIF and not contradicted), not found by us.
+        Whether that focal length was given (calibrated, or from EXIF and not contradicted) rather than estimated.
     camera_radial : (c,) bool array or None
-        Whether the camera's model has a radial term that may be found with its focal length.
+        Whether the camera's model has a radial term that may be estimated with its focal length.
     read_verdicts : (m,) str array or None
-        `EdgeVerdict` words given on reading; edges other than ``kept`` and ``rotation_only`` are not solved with.
+        `EdgeVerdict` words from reading; edges other than ``kept`` and ``rotation_only`` are not used by the solver.
     trusted : (m,) bool array or None
-        Edges that no filter may drop, on the user's word.
+        Edges that no filter may drop, as specified by the user.
     found_radial_terms : (c,) array or None
-        Radial terms, at the database's focal lengths, of cameras that the database tells no distortion of. Bearings are
-        taken with them.
+        Estimated radial terms, at the database's focal lengths, of cameras without distortion in the database. Bearings
+        are computed with them.
     verified_anew : (m,) bool array or None
-        Pairs whose matches or configuration are not those of the database, which did not explain each other.
+        Pairs that were verified again, since matches and configuration in the database were inconsistent.
     planar : (m,) bool array or None
-        Pairs explained by a homography; their relative pose is less certain.
+        Pairs explained by a homography, whose relative pose is less certain.
     triangulation_angles : (m,) array or None
         Median angle between the rays of an edge's inliers, radians.
     edge_information : (m, 5, 5) array or None
@@ -130,21 +130,21 @@ class ViewGraph:
 
     @property
     def has_rotation(self) -> BoolArray:
-        """Edges whose rotation may be used, (m,)."""
+        """Mask (m,) of the edges whose rotation may be used."""
         if self.read_verdicts is None:
             return np.ones(self.num_edges, dtype=bool)
         return np.isin(self.read_verdicts, [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
 
     @property
     def has_direction(self) -> BoolArray:
-        """Edges whose rotation and direction may be used, (m,)."""
+        """Mask (m,) of the edges whose rotation and direction may be used."""
         if self.read_verdicts is None:
             return np.ones(self.num_edges, dtype=bool)
         return np.asarray(self.read_verdicts == EdgeVerdict.KEPT)
 
     @property
     def has_inliers(self) -> bool:
-        """Whether the matched bearings are in the graph."""
+        """Whether the graph contains the bearings of the matches."""
         return self.inlier_offsets is not None and self.inlier_bearings1 is not None and len(self.inlier_bearings1) > 0
 
     def _check_shapes(self) -> None:
@@ -184,46 +184,46 @@ class ViewGraph:
                     f"ViewGraph.{name} has shape {value.shape}, expected {shape} (n={n} images, m={m} edges)"
                 )
         if self.image_names and len(self.image_names) != n:
-            raise GraphError(f"ViewGraph.image_names holds {len(self.image_names)} names for {n} images")
+            raise GraphError(f"ViewGraph.image_names has {len(self.image_names)} names for {n} images")
 
     def _check_values(self) -> None:
         n, edges, R, g = self.num_images, self.edges, self.cam2_from_cam1_rotations, self.cam2_in_cam1_directions
         if len(np.unique(self.image_ids)) != n:
             raise GraphError("ViewGraph.image_ids are not unique")
         if len(edges) and (edges.min() < 0 or edges.max() >= n):
-            raise GraphError(f"ViewGraph.edges point outside the {n} images: rows {edges.min()} to {edges.max()}")
+            raise GraphError(f"ViewGraph.edges has rows {edges.min()} to {edges.max()}, outside the {n} images")
         loops = np.flatnonzero(edges[:, 0] == edges[:, 1])
         if len(loops):
             raise GraphError(f"ViewGraph.edges: edge {loops[0]} links image row {edges[loops[0], 0]} to itself")
-        _refuse(
-            "cam2_from_cam1_rotations", np.asarray(~np.isfinite(R).all(axis=(1, 2))), "holds NaN or infinite values"
-        )
-        _refuse("cam2_in_cam1_directions", np.asarray(~np.isfinite(g).all(axis=1)), "holds NaN or infinite values")
+        _refuse("cam2_from_cam1_rotations", np.asarray(~np.isfinite(R).all(axis=(1, 2))), "has NaN or infinite values")
+        _refuse("cam2_in_cam1_directions", np.asarray(~np.isfinite(g).all(axis=1)), "has NaN or infinite values")
         skewed = np.asarray(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
-        _refuse("cam2_from_cam1_rotations", np.asarray(skewed | (np.linalg.det(R) < 0)), "is no rotation matrix")
+        _refuse("cam2_from_cam1_rotations", np.asarray(skewed | (np.linalg.det(R) < 0)), "is not a rotation matrix")
         _refuse(
-            "cam2_in_cam1_directions", np.asarray(np.abs(np.linalg.norm(g, axis=1) - 1.0) > 1e-6), "is no unit vector"
+            "cam2_in_cam1_directions",
+            np.asarray(np.abs(np.linalg.norm(g, axis=1) - 1.0) > 1e-6),
+            "is not a unit vector",
         )
         if self.inlier_offsets is not None:
             o, k = self.inlier_offsets, 0 if self.inlier_bearings1 is None else len(self.inlier_bearings1)
             if o[0] != 0 or o[-1] != k or (np.diff(o) < 0).any():
-                raise GraphError(f"ViewGraph.inlier_offsets must rise from 0 to the number of inliers {k}")
+                raise GraphError(f"ViewGraph.inlier_offsets must increase from 0 to the number of inliers {k}")
         if self.camera_idx is not None and len(self.camera_idx):
             last = self.camera_idx.max() if self.camera_focal_lengths is None else len(self.camera_focal_lengths) - 1
             if self.camera_idx.min() < 0 or self.camera_idx.max() > min(last, _MAX_ROW):
-                raise GraphError(f"ViewGraph.camera_idx holds rows that are no camera's: {self.camera_idx.max()}")
+                raise GraphError(f"ViewGraph.camera_idx has rows without a camera, up to {self.camera_idx.max()}")
         if self.num_inliers is not None:
             _refuse("num_inliers", np.asarray(self.num_inliers < 0), "is negative")
         if self.camera_focal_lengths is not None:
             f = self.camera_focal_lengths
-            _refuse("camera_focal_lengths", np.asarray(~((f > 0) & (f < np.inf))), "is no focal length in pixels")
+            _refuse("camera_focal_lengths", np.asarray(~((f > 0) & (f < np.inf))), "is not a focal length in pixels")
         if self.edge_information is not None:
-            _refuse("edge_information", _no_information(self.edge_information), "is no information matrix")
+            _refuse("edge_information", _invalid_information(self.edge_information), "is not an information matrix")
         for name in ("inlier_bearings1", "inlier_bearings2"):
             rays = getattr(self, name)
             if rays is not None:
                 squared = np.einsum("ka,ka->k", rays, rays)
-                _refuse(name, np.asarray(~(np.abs(squared - 1.0) < 2e-6)), "is no unit vector")
+                _refuse(name, np.asarray(~(np.abs(squared - 1.0) < 2e-6)), "is not a unit vector")
 
 
 _REQUIRED = ("image_ids", "edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions")
@@ -233,7 +233,7 @@ _TOGETHER = (
     ("camera_ids", "camera_focal_lengths"),
 )
 _MAX_ROW = 2**31
-"""A larger row number is a mistake, not a camera: arrays of that length would be made for it."""
+"""Upper limit of camera rows, since arrays of that length would be allocated for a larger, mistaken one."""
 
 
 _KINDS: dict[str, type] = {
@@ -266,28 +266,30 @@ def _array(name: str, value: object, kind: type) -> NDArray[np.generic]:
     try:
         found = np.asarray(value)
     except ValueError as error:
-        raise GraphError(f"ViewGraph.{name} is no array: {error}") from error
+        raise GraphError(f"ViewGraph.{name} is not an array: {error}") from error
     if found.ndim == 0:
         raise GraphError(f"ViewGraph.{name} must be an array, found {found}")
     if name in ("edges", "cam2_from_cam1_rotations", "cam2_in_cam1_directions") and found.size == 0:
         found = found.reshape(0, *{"edges": (2,), "cam2_from_cam1_rotations": (3, 3)}.get(name, (3,)))
     allowed, what = _ALLOWED[np.dtype(kind).kind]
     if found.size and found.dtype.kind not in allowed:
-        raise GraphError(f"ViewGraph.{name} must hold {what}, found {found.dtype}")
+        raise GraphError(f"ViewGraph.{name} must have {what}, found {found.dtype}")
     if (
         np.dtype(kind).kind == "i"
         and found.size
         and (found.max() > np.iinfo(kind).max or found.min() < np.iinfo(kind).min)
     ):
-        raise GraphError(f"ViewGraph.{name} holds {found.max()}, too large a number")
+        raise GraphError(
+            f"ViewGraph.{name} has values from {found.min()} to {found.max()}, too large for {kind.__name__}"
+        )
     return np.asarray(found, dtype=kind)
 
 
 _ALLOWED = {"i": ("iu", "integers"), "f": ("iuf", "real numbers"), "b": ("b", "True or False"), "U": ("UO", "words")}
 
 
-def _no_information(matrices: Array) -> BoolArray:
-    """Matrices (m, 5, 5) that are not finite, or have a negative variance, or are not symmetric."""
+def _invalid_information(matrices: Array) -> BoolArray:
+    """Mask (m,) of matrices (m, 5, 5) that are not finite, have a negative diagonal entry, or are not symmetric."""
     with np.errstate(invalid="ignore"):
         size = np.abs(matrices).max(axis=(1, 2), initial=0.0)
         skew = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max(axis=(1, 2), initial=0.0)

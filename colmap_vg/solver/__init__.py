@@ -1,1 +1,1 @@
-"""From a viewing graph to poses: the chain of named stages, its filters, and the state they share."""
+"""Solver of viewing graphs: a sequence of stages with outlier filters and a shared state."""

@@ -1,4 +1,4 @@
-"""Stage 4 of the solver: poses and free lenses at the minimum of all epipolar errors."""
+"""Stage 4 of the solver: epipolar adjustment of poses and free intrinsics, and removal of remaining outlier pairs."""
 
 from dataclasses import replace
 
@@ -21,33 +21,33 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 CONTRADICTION = 10.0
-"""Residuals of a pair over those of the median pair, in standard deviations, from which on it is false. What all pairs
-share, a lens not quite as modelled, is in the median; noise of one pair does not reach five."""
+"""Residual of a pair, in standard deviations, over that of the median pair, above which it is an outlier. Errors common
+to all pairs, such as unmodelled distortion, are in the median; noise of a single pair does not reach five."""
 MISFIT, MISFIT_PX = 3.0, 1.0
-"""Median error of a pair's matches at the adjusted cameras from which on they do not fit: over that of the median pair,
-and pixels."""
+"""Median error of an outlier pair's matches at the adjusted cameras: least multiple of that of the median pair, and
+least value in pixels."""
 
 
 def adjust_poses(
     state: SolverState, part: Subgraph, problem: EpipolarProblem, poses: PartPoses, options: SolveOptions
 ) -> tuple[Subgraph, PartPoses]:
-    """Poses and free focal lengths at the minimum of the epipolar errors.
+    """Adjust poses and free focal lengths to the matches; return the remaining part and its poses.
 
-    Reversed edges leave, and with them images that the rest does not fix: those stood on the wrong side of an edge.
+    Reversed edges and outliers are dropped, and images whose positions the remaining edges do not determine.
     """
     directions = state.graph.cam2_in_cam1_directions[part.edge_rows]
     found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     state.log.extend(found.log)
     problem, found, radial_terms = _with_radial_term(state, problem, found, directions)
     state.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
-    # Relative poses of bent rays contradict straight ones, right as both may be.
+    # Relative poses from distorted rays are not comparable with poses from undistorted ones.
     dropped = found.reversed_edges | (_contradicting(state, part, problem, found) & (radial_terms is None))
     if dropped.sum() > found.reversed_edges.sum():
         state.drop(part.edge_rows[dropped & ~found.reversed_edges], EdgeVerdict.CONTRADICTS_POSES)
         rest = problem.without(dropped)
         kept = part.with_edges(~dropped)
         if state.largest_rigid_part(kept, options.random_seed).num_images < part.num_images:
-            # Tracks that were not needed before may hold what is left.
+            # Tracks that were not needed before may determine the remaining positions.
             rest = epipolar_problem(state.graph, kept, options) or rest
         rest = replace(rest, free_focals=problem.free_focals & ~found.lost_focals)
         again = adjust_epipolar(
@@ -67,7 +67,7 @@ def adjust_poses(
     if found.lost_focals.any():
         count = int(found.lost_focals[group].sum())
         state.caveats.append(
-            f"The matches do not tell the focal length of {count} of {len(group)} cameras; it stays as it was read."
+            f"The matches do not determine the focal length of {count} of {len(group)} cameras; it is left as read."
         )
     fixed = fixed_part(state, part, options) if dropped.any() else part
     rows = part.rows_of(fixed.images)
@@ -87,13 +87,13 @@ def adjust_poses(
 def _with_radial_term(
     state: SolverState, problem: EpipolarProblem, found: AdjustmentResult, directions: Array
 ) -> tuple[EpipolarProblem, AdjustmentResult, Array | None]:
-    """The problem, its cameras and the radial terms (c,) after one was found, where lenses are free and ask for it."""
+    """Estimate a radial term if focal lengths are free; return the problem, its cameras and the radial terms (c,)."""
     graph, (group, first) = state.graph, focal_groups(state.graph)
     free = problem.free_focals & ~found.lost_focals
     if graph.camera_radial is None or not free.any():
         return problem, found, None
-    bendable = free & (np.bincount(group, weights=~graph.camera_radial, minlength=len(first)) == 0)
-    lens = fit_radial_term(problem, found, bendable) if bendable.any() else None
+    free_radials = free & (np.bincount(group, weights=~graph.camera_radial, minlength=len(first)) == 0)
+    lens = fit_radial_term(problem, found, free_radials) if free_radials.any() else None
     if lens is None:
         return problem, found, None
     start = lens.result
@@ -106,12 +106,12 @@ def _with_radial_term(
         scales_px=(start.scale_px,),
     )
     state.log.extend(again.log)
-    terms = np.where(bendable, lens.radial_term * np.square(again.focal_scales), 0.0)[group]
+    terms = np.where(free_radials, lens.radial_term * np.square(again.focal_scales), 0.0)[group]
     return lens.problem, again, np.asarray(terms)
 
 
 def _contradicting(state: SolverState, part: Subgraph, problem: EpipolarProblem, found: AdjustmentResult) -> BoolArray:
-    """Edges (e,) of a part whose relative poses and matches no noise takes that far from the adjusted cameras."""
+    """Mask (e,) of a part's edges whose relative poses and matches are outliers at the adjusted cameras."""
     graph, rows = state.graph, part.edge_rows
     if graph.edge_information is None:
         return np.zeros(len(rows), dtype=bool)
@@ -125,7 +125,7 @@ def _contradicting(state: SolverState, part: Subgraph, problem: EpipolarProblem,
     )
     contradicting = (sigmas > CONTRADICTION * max(float(np.median(sigmas)), 1.0)) & ~state.trusted[rows]
     if contradicting.any():
-        # A pose by itself may be the worse of two that nearly explain a plane's matches.
+        # A pose alone is no evidence: it may be the wrong one of two that nearly explain the matches of a plane.
         errors = edge_errors(problem, found)
         contradicting &= errors > max(MISFIT * float(np.median(errors)), MISFIT_PX)
     return np.asarray(contradicting)

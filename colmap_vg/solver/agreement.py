@@ -1,4 +1,4 @@
-"""How many of a graph's pairs, and of their matches, agree with solved cameras."""
+"""Agreement of a graph's pairs, and of their matches, with solved cameras."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,34 +12,35 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MAX_ROTATION_DEG = 5.0
-"""Of a pair's rotation from that of the cameras."""
+"""Largest angle between the rotation of a pair that agrees and that of the cameras, degrees."""
 MAX_DIRECTION_SIGMAS, MODEL_SIGMA_DEG, UNKNOWN_SIGMA_DEG = 3.0, 1.0, 3.0
-"""Of a pair's direction, whose standard deviation is that of its matches and what the lens model leaves; the last is
-the deviation where the graph has no information."""
+"""Largest direction error of a pair that agrees, in standard deviations; the part of the standard deviation due to the
+lens model, degrees; and the standard deviation if the graph has no information, degrees."""
 
 
 def pair_agreement(graph: ViewGraph, rotations: Array, centers: Array, component: IntArray) -> tuple[Agreement, ...]:
-    """Agreement of each component with its pairs.
+    """Compute the agreement of each component with its pairs.
 
     Parameters
     ----------
     graph : ViewGraph
     rotations : (n, 3, 3) array
-        cam_from_world.
+        cam_from_world rotations.
     centers : (n, 3) array
+        Projection centres, frame of their component.
     component : (n,) int array
-        Component of each image, from 0; -1 where unsolved.
+        Component of each image, from 0; -1 if unsolved.
 
     Returns
     -------
     tuple of Agreement
-        In the order of the components. All pairs count whose own relative pose is known, whatever became of them.
+        One per component, in order. All pairs with a known relative pose count, also those dropped as outliers.
     """
     rotation, direction = pose_errors_deg(graph, rotations, centers, component)
     inliers = np.ones(graph.num_edges) if graph.num_inliers is None else graph.num_inliers.astype(np.float64)
     sigma = np.full(graph.num_edges, UNKNOWN_SIGMA_DEG)
     if graph.edge_information is not None:
-        # Directions that no match sees get a standard deviation of a radian instead of an infinite one.
+        # Directions that no match constrains get a standard deviation of a radian instead of an infinite one.
         covariance = np.linalg.inv(graph.edge_information + np.eye(5))[:, 3:, 3:]
         sigma = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
     turned = rotation <= MAX_ROTATION_DEG
@@ -65,20 +66,22 @@ def _share(weights: Array, agree: NDArray[np.bool_], among: NDArray[np.bool_]) -
 
 
 def pose_errors_deg(graph: ViewGraph, rotations: Array, centers: Array, component: IntArray) -> tuple[Array, Array]:
-    """Angles between the edges' rotations and directions and those of solved cameras.
+    """Angles between the relative rotations and directions of edges and those of solved cameras.
 
     Parameters
     ----------
     graph : ViewGraph
     rotations : (n, 3, 3) array
-        cam_from_world.
+        cam_from_world rotations.
     centers : (n, 3) array
+        Projection centres, frame of their component.
     component : (n,) int array
+        Component of each image, from 0; -1 if unsolved.
 
     Returns
     -------
     rotation, direction : (m,) array
-        Degrees; NaN where the images share no component, or the edge has no rotation or direction of its own.
+        Degrees; NaN if the images are in no common component, or the edge has no rotation or direction.
     """
     i, j = graph.edges.T
     same = (component[i] >= 0) & (component[i] == component[j])

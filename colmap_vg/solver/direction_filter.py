@@ -1,7 +1,8 @@
-"""Which directions contradict the rest: an outlier-robust fit of positions, and every edge's angle to it.
+"""Residuals of directions at an outlier-robust fit of positions.
 
-Least unsquared deviations give a start that gross outliers do not fold, being convex. Then steps of Alg. 1O with
-Geman-McClure weights of shrinking scale on the chordal distance between measured and solved directions forget them.
+Least unsquared deviations, a convex problem, give initial positions that gross outliers do not fold. Steps of Alg. 1O
+with Geman-McClure weights of decreasing scale on the chordal distance between measured and solved directions then
+remove the influence of outliers.
 """
 
 import numpy as np
@@ -17,16 +18,18 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LUD_ITERATIONS = 10
-"""Reweightings; twice or four times as many change no verdict (rings of 50 to 1,000 cameras, 20-40 % outliers)."""
+"""Reweighting iterations of LUD; two or four times as many change no verdict (rings of 50 to 1,000 cameras, 20-40 %
+outliers)."""
 SCALES_DEG = (20.0, 14.0, 10.0, 7.0, 5.0)
-"""Geman-McClure scales, degrees; the last is COLMAP's for rotations, too."""
+"""Successive Geman-McClure scales, degrees; the last is COLMAP's default for rotations."""
 ITERATIONS_PER_SCALE = 6
+"""Steps of Alg. 1O at each scale."""
 
 
 def robust_direction_residuals(
     num_images: int, edges: IntArray, directions_world: Array, weights: Array | None = None
 ) -> tuple[Array, Array]:
-    """Positions that most directions agree on, and each direction's angle to them.
+    """Fit positions robustly to directions, and compute the angle of each direction to them.
 
     Parameters
     ----------
@@ -42,7 +45,7 @@ def robust_direction_residuals(
     -------
     projection_centers : (n, 3) array
     angles : (m,) array
-        Between measured and solved directions, radians.
+        Angles between measured and solved directions, radians.
 
     Raises
     ------
@@ -67,9 +70,9 @@ def _chordal(p: Array, edges: IntArray, directions: Array, size: float) -> Array
 def _direction_step(
     system: LaplacianSystem, p: Array, edges: IntArray, directions: Array, weights: Array, size: float
 ) -> Array:
-    """One step of Alg. 1O: LS2 at the lengths of p."""
+    """One step of Alg. 1O: LS2 at the edge lengths of p."""
     length = edge_lengths(p, edges, size)
-    # Weights of vanished edges would swamp the rest: no edge counts as shorter than a thousandth of the median.
+    # Lengths have a lower limit of a thousandth of the median, so that weights of vanishing edges do not dominate.
     length = np.maximum(length, 1e-3 * np.median(length))
     new = centered(system.factor(weights / length**2).solve(system.right_side(weights / length, directions)))
     return np.asarray(new * (size / spread(new)))

@@ -1,9 +1,9 @@
-"""Stage 2 of the solver: the part whose positions its pairs fix, without directions that contradict the rest."""
+"""Stage 2 of the solver: the part whose positions are determined, after removing outlier directions."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.baseline_lengths import length_links
+from colmap_vg.epipolar.baseline_lengths import estimate_baseline_ratios
 from colmap_vg.epipolar.problem import epipolar_problem
 from colmap_vg.linear.robust_losses import geman_mcclure_weight
 from colmap_vg.options import SolveOptions
@@ -20,12 +20,13 @@ from colmap_vg.solver.state import SolverState
 Array = NDArray[np.float64]
 
 TRUST_PER_MEDIAN, TRUST_SCALES_DEG = 20.0, (3.0, 10.0)
-"""Geman-McClure scale of what a rotation's residual says of the direction, over the median residual, and its range. A
-false pair across a long street would otherwise fold it: it costs more displacement than tearing a street apart."""
+"""Geman-McClure scale for weights of directions by rotation residuals, over the median residual, and its range in
+degrees. Without these weights a false pair across a long street would fold it, since its displacement error is
+larger."""
 
 
 def filter_directions(state: SolverState, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:
-    """The largest part that its pairs fix, after edges whose directions contradict the rest have gone."""
+    """Drop edges whose directions are outliers; return the largest part whose positions are determined."""
     rigid = fixed_part(state, part, options)
     if rigid.num_images < 3 or options.outlier_filter == "none":
         return rigid
@@ -44,7 +45,7 @@ def filter_directions(state: SolverState, part: Subgraph, rotations: Array, opti
 
 
 def fixed_part(state: SolverState, part: Subgraph, options: SolveOptions) -> Subgraph:
-    """The largest part that directions fix or, where these leave images out, directions and tracks of three views."""
+    """Largest part whose positions directions determine, or directions and three-view tracks if that is not all."""
     fixed = state.largest_rigid_part(part, options.random_seed)
     if fixed.num_images == part.num_images or options.method != "epipolar":
         return fixed
@@ -54,13 +55,15 @@ def fixed_part(state: SolverState, part: Subgraph, options: SolveOptions) -> Sub
     if problem is None:
         return fixed
     rows = kept.edge_rows
-    links = length_links(problem, graph.cam2_from_cam1_rotations[rows], graph.cam2_in_cam1_directions[rows])
-    state.note_ratios(rows[links.edges[links.firm]])
+    ratios = estimate_baseline_ratios(
+        problem, graph.cam2_from_cam1_rotations[rows], graph.cam2_in_cam1_directions[rows]
+    )
+    state.note_ratios(rows[ratios.edges[ratios.reliable]])
     return state.largest_rigid_part(part, options.random_seed)
 
 
 def _rotation_trust(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:
-    """Weights (e,) of directions by how well their edges' rotations agree: a pair that is wrong is so in both."""
+    """Weights (e,) of directions by the rotation residuals of their edges, since false pairs are wrong in both."""
     residuals = rotation_residuals(part.edges, graph.cam2_from_cam1_rotations[part.edge_rows], rotations)
     scale = np.clip(TRUST_PER_MEDIAN * np.median(residuals), *np.radians(TRUST_SCALES_DEG))
     return geman_mcclure_weight((residuals / scale) ** 2)

@@ -1,4 +1,4 @@
-"""What each edge counts: by the precision of its rotation, by its number of inliers, or all the same."""
+"""Weights of edges, by the precision of their rotations or by their number of inliers."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,27 +10,29 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 PLANAR_WEIGHT = 1.0 / 3.0
-"""Pairs explained by a homography have less certain poses (seen on real databases: up to 12 and 85 degrees wrong)."""
+"""Factor on the weight of pairs explained by a homography, whose poses are less certain (on real databases errors of up
+to 12 and 85 degrees were seen)."""
 TRUSTED_LIKELIHOOD = 10.0
-"""Median edges that one counts for which the user trusts."""
+"""Least likelihood of an edge that the user trusts, in those of the median edge."""
 MODEL_SIGMA = 1e-3
-"""Radians; what the lens model and correlated keypoints leave in a relative rotation however many matches it has."""
+"""Standard deviation of a relative rotation due to the lens model and correlated keypoints, radians; it does not
+decrease with the number of matches."""
 
 
 def edge_weights(graph: ViewGraph, edge_rows: IntArray, options: SolveOptions) -> Array:
-    """Multipliers of squared residuals of chosen edges.
+    """Weights of the squared residuals of chosen edges.
 
-    By information they are ``1 / (tr(Σ_R) / 3 + s²)`` with the marginal covariance Σ_R of the rotation, for directions
-    too: measured on real graphs, positions come out better than with the direction's own covariance, which takes pairs
-    with long baselines for certain that are few and far apart.
+    By information they are ``1 / (tr(Σ_R) / 3 + s²)`` with the marginal covariance Σ_R of the rotation, for directions,
+    too: on real graphs positions were better than with the covariance of the direction, which overweights pairs with
+    long baselines.
 
     Parameters
     ----------
     graph : ViewGraph
     edge_rows : (e,) int array
     options : SolveOptions
-        `edge_weights`: "information" means "inliers" where the graph has no information, and "inliers" means "unit"
-        where it has no numbers of inliers.
+        `edge_weights`: "information" falls back to "inliers" if the graph has no information, and "inliers" to "unit"
+        if it has no numbers of inliers.
 
     Returns
     -------
@@ -39,7 +41,7 @@ def edge_weights(graph: ViewGraph, edge_rows: IntArray, options: SolveOptions) -
     """
     weights = np.ones(len(edge_rows))
     if options.edge_weights == "information" and graph.edge_information is not None:
-        # Directions that no match sees get a standard deviation of a radian instead of an infinite one.
+        # Directions that no match constrains get a standard deviation of a radian instead of an infinite one.
         covariance = np.linalg.inv(graph.edge_information[edge_rows] + np.eye(5))
         weights = 1.0 / (np.trace(covariance[:, :3, :3], axis1=1, axis2=2) / 3.0 + MODEL_SIGMA**2)
     elif options.edge_weights != "unit":
@@ -51,10 +53,10 @@ def edge_weights(graph: ViewGraph, edge_rows: IntArray, options: SolveOptions) -
 
 
 def edge_likelihoods(graph: ViewGraph, edge_rows: IntArray) -> Array:
-    """Evidence that chosen edges are right, however precise: their numbers of inliers.
+    """Evidence that chosen edges are correct, regardless of their precision: their numbers of inliers.
 
-    Planar pairs count in full: their poses are less precise, but nine in ten of those with 60 to 120 inliers were right
-    on an object of whose other pairs with as many only one in thirty was.
+    Planar pairs are not down-weighted: their poses are less precise, but on one object nine in ten of those with 60 to
+    120 inliers were correct, and only one in thirty of the other pairs with as many.
 
     Parameters
     ----------
@@ -64,8 +66,7 @@ def edge_likelihoods(graph: ViewGraph, edge_rows: IntArray) -> Array:
     Returns
     -------
     (e,) array
-        Positive, median 1; all 1 where the graph has no numbers of inliers. Edges that the user trusts count as ten
-        median ones at least.
+        Positive, median 1; all 1 if the graph has no numbers of inliers. At least 10 for edges that the user trusts.
     """
     likelihoods = np.ones(len(edge_rows))
     if graph.num_inliers is not None:

@@ -1,10 +1,10 @@
-"""1DSfM: find edges whose directions contradict many one-dimensional orders of the cameras.
+"""1DSfM: outlier directions by their inconsistency with one-dimensional orders of the cameras.
 
-Wilson & Snavely, "Robust Global Translations with 1DSfM" (ECCV 2014). Projected on a line, edge (i, j) says which of
-the two cameras comes first, and by how much it matters (|projection|). An order of all cameras that breaks as little of
-this as possible is a minimum feedback arc set, found greedily: take a camera that no remaining one must precede (a
-source); where there is none, the one with the best ratio (outgoing weight + 1) / (incoming weight + 1). An edge that is
-broken on many lines is an outlier.
+Wilson & Snavely, "Robust Global Translations with 1DSfM" (ECCV 2014). Projected on a line, edge (i, j) determines the
+order of its two cameras, with weight |projection|. The order of all cameras that violates the least weight is a minimum
+feedback arc set, found greedily: the next camera is one that no remaining camera must precede (a source) or, if there
+is none, that of largest ratio (outgoing weight + 1) / (incoming weight + 1). An edge that is violated on many lines is
+an outlier.
 """
 
 from typing import TypeVar
@@ -28,7 +28,7 @@ def one_dsfm_broken_weights(
     seed: int = 0,
     weights: ArrayLike | None = None,
 ) -> Array:
-    """How much of each edge is broken by greedy one-dimensional orders, averaged over random lines.
+    """Mean weight by which greedy one-dimensional orders violate each edge, over random lines.
 
     Parameters
     ----------
@@ -38,21 +38,22 @@ def one_dsfm_broken_weights(
         Unit vectors in the world from the first to the second image of each edge, ``R_i^T gamma^l_ij`` for
         cam_from_world rotations R.
     num_directions : int
-        Lines; the paper's 48.
+        Number of lines; default 48, as published.
     seed : int
-        Of the lines.
+        Random seed of the lines.
     weights : (m,) array, optional
-        Say of each edge in the orders and in the density of lines. Default: all one, as published.
+        Weight of each edge in the orders and in the density of lines. Default: all one, as published.
 
     Returns
     -------
     (m,) array
-        Mean of |projection| over the lines whose order contradicts the edge, 0 to 1. The paper drops edges over 0.1.
+        Sum of |projection| over the lines whose order violates the edge, divided by the number of lines; 0 to 1. The
+        paper drops edges above 0.1.
 
     Raises
     ------
     GraphError
-        Shapes differ, rows lie outside the images, directions or weights are not finite, or no line is asked for.
+        Shapes differ, rows are out of range, directions or weights are not finite, or `num_directions` is below 1.
     """
     edges, directions, w = _checked(num_images, edges, directions_world, weights)
     if num_directions < 1:
@@ -72,10 +73,10 @@ def one_dsfm_broken_weights(
 def projection_directions(
     directions: Array, num_directions: int, rng: np.random.Generator, weights: Array | None = None
 ) -> Array:
-    """Lines drawn from a kernel density of the edge directions: most lie where edges have most to say.
+    """Sample lines from a kernel density of the edge directions.
 
-    A draw from a Gaussian kernel density is an edge's direction plus the kernel's noise. The kernel has the covariance
-    of the directions times Scott's factor m^(-1/7) squared (three dimensions).
+    A sample from a Gaussian kernel density is the direction of a random edge plus noise of the kernel. The kernel has
+    the covariance of the directions times the square of Scott's factor m^(-1/7) (three dimensions).
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def projection_directions(
     """
     m = len(directions)
     share = np.full(m, 1.0 / m) if weights is None or weights.sum() == 0 else weights / weights.sum()
-    # A line has no sign, so an edge and its reverse are the same: the kernel is centred.
+    # Lines have no sign, so that an edge and its reverse are equivalent: the kernel is centred.
     covariance = (share[:, None] * directions).T @ directions
     values, vectors = np.linalg.eigh(covariance)
     spread = m ** (-1.0 / 7.0) * np.sqrt(np.maximum(values, 0.0))
@@ -104,9 +105,10 @@ def projection_directions(
 def order_positions(
     num_images: int, edges: IntArray, directions: Array, lines: Array, weights: Array | None = None
 ) -> IntArray:
-    """Place of each image in the greedy order along each line. All lines advance together, one image each per step.
+    """Position of each image in the greedy order along each line.
 
-    Ties go to the lowest row. The cost is O(lines * (m + n^2)) array operations in n Python steps.
+    All lines are processed together, one image each per step. Ties go to the lowest row. The cost is
+    O(lines * (m + n^2)) array operations in n Python steps.
 
     Parameters
     ----------
@@ -148,7 +150,7 @@ def order_positions(
 
 
 class _Arcs:
-    """Edges by image: for each image its neighbours and the vectors that lead to them."""
+    """Adjacency lists: for each image its neighbours and the vectors to them."""
 
     def __init__(self, num_images: int, edges: IntArray, vectors: Array) -> None:
         tail = np.concatenate([edges[:, 0], edges[:, 1]])
@@ -162,7 +164,7 @@ class _Arcs:
         self.has_parallel = bool(((tail[1:] == tail[:-1]) & (self._head[1:] == self._head[:-1])).any())
 
     def arcs_of(self, images: IntArray) -> tuple[IntArray, IntArray, Array]:
-        """Arcs that leave each of the given images: which of them (k,), the neighbour (k,), the vector (k, 3)."""
+        """Outgoing arcs of the given images: row in `images` (k,), neighbour (k,), vector (k, 3)."""
         counts = self._counts[images]
         which = np.repeat(np.arange(len(images)), counts)
         first = np.cumsum(counts) - counts
@@ -186,7 +188,7 @@ def _initial_degrees(num_images: int, edges: IntArray, vectors: Array, lines: Ar
 
 
 def _score(num_incoming: IntArray, incoming: Array, outgoing: Array) -> Array:
-    """Infinite for sources; they are counted, because differences of weights do not come back to zero exactly."""
+    """Greedy score, infinite for sources: nodes with no incoming arcs by count, since weights do not cancel exactly."""
     return np.where(num_incoming == 0, np.inf, (outgoing + 1.0) / (incoming + 1.0))
 
 
@@ -210,9 +212,9 @@ def _checked(
             + ("" if w is None else f" and weights of shape {w.shape}")
         )
     if len(edges) and (edges.min() < 0 or edges.max() >= num_images):
-        raise GraphError(f"1DSfM: edges hold rows {edges.min()} to {edges.max()} of {num_images} images")
+        raise GraphError(f"1DSfM: edges have rows {edges.min()} to {edges.max()} of {num_images} images")
     if not np.isfinite(directions).all():
-        raise GraphError("1DSfM: directions hold NaN or infinite values")
+        raise GraphError("1DSfM: directions have NaN or infinite values")
     if w is not None and (not np.isfinite(w).all() or (w < 0).any()):
         raise GraphError("1DSfM: weights must be finite and not negative")
     return edges, directions, w

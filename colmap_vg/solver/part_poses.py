@@ -1,4 +1,4 @@
-"""Poses of a part of a graph on their way through the solver."""
+"""Intermediate poses of a part of a graph, passed between the stages of the solver."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PartPoses:
-    """Poses of a part: cam_from_world (k, 3, 3), centres (k, 3), focal factors of the graph's cameras (c,)."""
+    """Poses of a part of a graph.
+
+    Attributes
+    ----------
+    rotations : (k, 3, 3) array
+        cam_from_world rotations.
+    centers : (k, 3) array
+        Projection centres.
+    focal_scales : (c,) array
+        Factors on the focal lengths of the graph's cameras.
+    converged : bool
+    covariances : tuple of two (k, 3, 3) arrays, optional
+        Of the centres and of the rotations.
+    radial_terms : (c,) array, optional
+        Radial terms of the graph's cameras.
+    """
 
     rotations: Array
     centers: Array
@@ -24,6 +39,6 @@ class PartPoses:
 
 
 def world_directions(graph: ViewGraph, part: Subgraph, rotations: Array) -> Array:
-    """``gamma_ij = R_i gamma^l_ij`` with R_i camera to world, (e, 3)."""
+    """Directions in the world frame, ``gamma_ij = R_i gamma^l_ij`` with R_i camera to world: (e, 3)."""
     local = graph.cam2_in_cam1_directions[part.edge_rows]
     return np.asarray(np.einsum("kba,kb->ka", rotations[part.edges[:, 0]], local))

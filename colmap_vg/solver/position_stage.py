@@ -1,4 +1,4 @@
-"""Stage 3 of the solver: positions, by the lengths of baselines, by directions alone, or by the method asked for."""
+"""Stage 3 of the solver: positions from baseline lengths, from directions alone, or by the method in the options."""
 
 from dataclasses import replace
 from typing import Literal
@@ -6,7 +6,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.baseline_lengths import connects_all, length_links, positions_by_lengths, solve_lengths
+from colmap_vg.epipolar.baseline_lengths import (
+    connects_all,
+    estimate_baseline_ratios,
+    positions_by_lengths,
+    solve_lengths,
+)
 from colmap_vg.epipolar.problem import EpipolarProblem
 from colmap_vg.errors import GraphError
 from colmap_vg.options import SolveOptions
@@ -30,12 +35,13 @@ from colmap_vg.solver.state import MIN_PART_IMAGES, SolverState
 Array = NDArray[np.float64]
 
 ROUGH_ITERATIONS = 20
-"""Outer iterations of Alg. 2 before the epipolar adjustment, at most."""
+"""Maximum number of outer iterations of Alg. 2 before the epipolar adjustment."""
 MAX_DEVIATION = 0.1
-"""Of a position, shares of the scene's median radius, where directions alone fix it: five times it is half of that."""
-MAX_SHARE_LEAVING, MAX_ROUNDS_OF_LEAVING = 0.1, 20
-"""Images that leave at once, and how often: one that is far off takes its neighbours' certainty with it, so that of
-those that leave together none is three times as certain as another."""
+"""Largest standard deviation of a position determined by directions alone, as a share of the scene's median radius;
+five standard deviations are half of it."""
+MAX_SHARE_REMOVED, MAX_REMOVAL_ROUNDS = 0.1, 20
+"""Maximum fraction of images removed per round, and number of rounds. An uncertain image makes its neighbours seem
+uncertain, so images with less than a third of the largest deviation are not removed in the same round."""
 _BASELINES = {
     "bata": solve_bata,
     "cle1": solve_cle1,
@@ -51,13 +57,15 @@ _METRICS_OF_ALTERNATION: dict[str, Literal["C", "O"]] = {"2C": "C", "2O": "O", "
 def place_by_lengths(
     state: SolverState, part: Subgraph, problem: EpipolarProblem, poses: PartPoses, options: SolveOptions
 ) -> PartPoses:
-    """Positions by the lengths that shared tracks give to baselines; by Alg. 2O where these do not reach all images."""
+    """Solve for positions from directions and baseline lengths; initialise by Alg. 2O if lengths do not connect all."""
     graph, rows, n = state.graph, part.edge_rows, part.num_images
-    links = length_links(problem, graph.cam2_from_cam1_rotations[rows], graph.cam2_in_cam1_directions[rows])
-    lengths = solve_lengths(len(rows), links)
+    ratios = estimate_baseline_ratios(
+        problem, graph.cam2_from_cam1_rotations[rows], graph.cam2_in_cam1_directions[rows]
+    )
+    lengths = solve_lengths(len(rows), ratios)
     start = None
     if not connects_all(n, part.edges, np.isfinite(lengths)):
-        # The adjustment goes on from wherever Alg. 2 is: its last digits would be lost work.
+        # The epipolar adjustment follows, so that a rough solution of Alg. 2 suffices.
         rough = replace(options, method="2O", max_num_iterations=ROUGH_ITERATIONS, convergence_tolerance=1e-3)
         poses = place_by_method(state, part, poses, rough)
         start = poses.centers
@@ -68,9 +76,9 @@ def place_by_lengths(
 def place_by_directions(
     state: SolverState, part: Subgraph, poses: PartPoses, options: SolveOptions
 ) -> tuple[Subgraph, PartPoses]:
-    """Positions by a robust fit of the directions; images that these do not fix well leave, the worst first."""
+    """Solve for positions by a robust fit of the directions; remove images of uncertain position, the worst first."""
     whole, start = part, None
-    for rounds_left in reversed(range(MAX_ROUNDS_OF_LEAVING + 1)):
+    for rounds_left in reversed(range(MAX_REMOVAL_ROUNDS + 1)):
         n, rotations = part.num_images, poses.rotations[whole.rows_of(part.images)]
         directions = world_directions(state.graph, part, rotations)
         weights = edge_weights(state.graph, part.edge_rows, options)
@@ -85,9 +93,9 @@ def place_by_directions(
         uncertain = deviations > MAX_DEVIATION * radius
         if not uncertain.any() or rounds_left == 0:
             break
-        worst = max(np.quantile(deviations, 1.0 - MAX_SHARE_LEAVING), deviations.max() / 3.0)
-        leaving = uncertain & (deviations >= worst)
-        smaller = state.without(part, leaving, ImageVerdict.UNCERTAIN, options.random_seed)
+        worst = max(np.quantile(deviations, 1.0 - MAX_SHARE_REMOVED), deviations.max() / 3.0)
+        removed = uncertain & (deviations >= worst)
+        smaller = state.without(part, removed, ImageVerdict.UNCERTAIN, options.random_seed)
         if smaller.num_images < MIN_PART_IMAGES:
             break
         part, start = smaller, centers[part.rows_of(smaller.images)]
@@ -97,7 +105,7 @@ def place_by_directions(
 
 
 def place_by_method(state: SolverState, part: Subgraph, poses: PartPoses, options: SolveOptions) -> PartPoses:
-    """Positions, or positions and rotations, by the algorithm on relative poses that the options name."""
+    """Solve for positions, or positions and rotations, by the method in the options."""
     directions = world_directions(state.graph, part, poses.rotations)
     weights = edge_weights(state.graph, part.edge_rows, options)
     if options.method in _BASELINES:
@@ -121,7 +129,7 @@ def _with_positions(state: SolverState, poses: PartPoses, found: PositionResult)
 def _by_fixed_point(
     state: SolverState, part: Subgraph, poses: PartPoses, directions: Array, weights: Array, options: SolveOptions
 ) -> PartPoses:
-    """Alg. 1: positions at given rotations."""
+    """Solve for positions at given rotations by Alg. 1."""
     found = solve_fixed_point(
         part.num_images,
         part.edges,
@@ -139,12 +147,12 @@ def _by_fixed_point(
 def _by_alternation(
     state: SolverState, part: Subgraph, poses: PartPoses, weights: Array, options: SolveOptions
 ) -> PartPoses:
-    """Alg. 2: positions and rotations; 2W weighs by information, and robustly."""
+    """Solve for positions and rotations by Alg. 2; 2W uses information matrices and robust weights."""
     graph, informed, information = state.graph, options.method == "2W", None
     if informed:
         if graph.edge_information is None:
             raise GraphError(
-                "method 2W weighs edges by their information, and the graph holds none: read it from a database, set"
+                "method 2W needs information matrices of edges, and the graph has none: read it from a database, set"
                 " ViewGraph.edge_information, or solve with method 2C or 2O"
             )
         information = graph.edge_information[part.edge_rows]

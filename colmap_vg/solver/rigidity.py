@@ -1,13 +1,14 @@
-"""Parallel rigidity: which images have positions that their edges' directions fix, up to one translation and scale.
+"""Parallel rigidity: images whose positions are determined by edge directions, up to translation and scale.
 
-Directions along the edges of a graph fix all positions in general when the only motions that keep every direction are
-translation and scaling of the whole (Ozyesil & Singer, CVPR 2015). A motion x keeps the direction of edge (i, j) when
-``x_j - x_i = s_ij (p_j - p_i)``. Two edges belong to one rigid component when they have the same stretch ``s`` in every
-motion; for positions and a motion drawn at random that holds with probability one (Kennedy et al., IROS 2012).
+Generic positions are determined by the directions of a graph's edges if the only motions that preserve all directions
+are translation and scaling of the whole (Ozyesil & Singer, CVPR 2015). A motion x preserves the direction of edge
+(i, j) if ``x_j - x_i = s_ij (p_j - p_i)``. Two edges belong to one rigid component if they have the same stretch ``s``
+in every motion; testing random positions and one random motion is correct with probability one (Kennedy et al., IROS
+2012).
 
-The known ratio of two edges' lengths keeps ``s_e = s_f`` and is one more equation of the motion. Its spanning argument:
-edges that ratios join, directly or through others, have one stretch, and where they connect images they fix these; what
-is left is rigidity between such bodies. The ranks of the full system of both are the same in general (see the tests).
+A known ratio of the lengths of two edges adds the equation ``s_e = s_f``. Edges connected by ratios, directly or
+through others, have the same stretch and, if they connect images, form a rigid body; rigidity between such bodies
+remains to be tested. The ranks of the full system of both are the same generically (see the tests).
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 SAME_STRETCH = 1e-6
-"""Stretches closer than this are taken as equal; a random motion separates components by about 1."""
+"""Largest difference of equal stretches, dimensionless; a random motion separates components by about 1."""
 
 
 def largest_rigid_component(
@@ -35,14 +36,14 @@ def largest_rigid_component(
     num_images : int
     edges : (m, 2) int array
     seed : int
-        Of the random positions at which rigidity is tested.
+        Random seed of the positions at which rigidity is tested.
     ratios : (q, 2) int array, optional
-        Rows of edges the ratio of whose lengths is known.
+        Rows of two edges whose length ratio is known.
 
     Returns
     -------
     images : (num_images,) bool array
-        All False when no edge exists.
+        All False if there are no edges.
     edges : (m,) bool array
         Edges of that component.
     """
@@ -54,7 +55,7 @@ def largest_rigid_component(
 
 
 def rigid_components(num_images: int, edges: IntArray, seed: int = 0, ratios: IntArray | None = None) -> IntArray:
-    """Rigid component of each edge, 0 for the one with most images. An image may lie in several components.
+    """Rigid component of each edge, 0 for the one with most images. An image may be in several components.
 
     Parameters
     ----------
@@ -62,8 +63,9 @@ def rigid_components(num_images: int, edges: IntArray, seed: int = 0, ratios: In
     edges : (m, 2) int array
         Parallel edges count once.
     seed : int
+        Random seed of the positions at which rigidity is tested.
     ratios : (q, 2) int array, optional
-        Rows of edges the ratio of whose lengths is known.
+        Rows of two edges whose length ratio is known.
 
     Returns
     -------
@@ -77,7 +79,7 @@ def rigid_components(num_images: int, edges: IntArray, seed: int = 0, ratios: In
     rest = np.flatnonzero(~inside)
     if len(rest):
         tested = np.concatenate([sparse_edges, edges[rest]])
-        # All edges of the body have the stretch of its first.
+        # All edges of the body have the stretch of its first edge.
         row = np.zeros(len(edges), dtype=np.int64)
         row[rest] = len(sparse_edges) + np.arange(len(rest))
         equal = np.zeros((0, 2), dtype=np.int64) if ratios is None else row[ratios]
@@ -90,13 +92,13 @@ def rigid_components(num_images: int, edges: IntArray, seed: int = 0, ratios: In
 
 
 def _grow_rigid_body(num_images: int, edges: IntArray) -> tuple[BoolArray, IntArray]:
-    """A large rigid set grown by two edges for each image, and just those edges (at least one)."""
+    """Grow a rigid set of images by two edges per added image; return its mask and the edges used (at least one)."""
     pairs = np.unique(np.sort(edges, axis=1), axis=0)
     weights = np.ones(len(pairs))
     A = sp.coo_array((weights, (pairs[:, 0], pairs[:, 1])), shape=(num_images, num_images)).tocsr()
     A = sp.csr_array(A + A.T)
     degree = np.diff(A.indptr)
-    # The edge whose ends have the highest degrees is the likeliest to lie in the core.
+    # Start at the edge whose ends have the highest degrees, which is likely to be in a rigid core.
     start = pairs[np.argmax(np.minimum(degree[pairs[:, 0]], degree[pairs[:, 1]]))]
     level = np.full(num_images, np.iinfo(np.int64).max)
     level[start] = 0
@@ -122,7 +124,7 @@ def _grow_rigid_body(num_images: int, edges: IntArray) -> tuple[BoolArray, IntAr
 
 
 def _labels_by_stretch(num_images: int, edges: IntArray, seed: int, equal: IntArray) -> IntArray:
-    """Groups of edges of one stretch in a random motion that keeps directions, and the stretches of `equal` (q, 2)."""
+    """Label edges by their stretch in a random motion that preserves directions, and ratios of edges `equal` (q, 2)."""
     rng = np.random.default_rng(seed)
     p = rng.standard_normal((num_images, 3))
     d = p[edges[:, 1]] - p[edges[:, 0]]
@@ -137,7 +139,7 @@ def _labels_by_stretch(num_images: int, edges: IntArray, seed: int, equal: IntAr
         matrix = sp.csc_array(matrix + difference.T @ difference)
     factor = factorize(matrix)
     x = rng.standard_normal(3 * num_images)
-    # Inverse iteration: what is not a motion shrinks by damping / eigenvalue each time.
+    # Inverse iteration: components outside the null space decrease by damping / eigenvalue each time.
     for _ in range(4):
         x = damping * factor.solve(x)
         x /= np.linalg.norm(x) / np.sqrt(num_images)
@@ -151,7 +153,7 @@ def _labels_by_stretch(num_images: int, edges: IntArray, seed: int, equal: IntAr
 
 
 def _stretches(num_images: int, edges: IntArray, p: NDArray[np.float64]) -> sp.csr_array:
-    """The matrix (m, 3n) that takes motions to stretches ``(p_j - p_i) . (x_j - x_i) / |p_j - p_i|^2``."""
+    """Matrix (m, 3n) that maps motions to stretches ``(p_j - p_i) . (x_j - x_i) / |p_j - p_i|^2``."""
     d = p[edges[:, 1]] - p[edges[:, 0]]
     d /= np.sum(d**2, axis=1, keepdims=True)
     columns = 3 * edges[:, :, None] + np.arange(3)
@@ -161,7 +163,7 @@ def _stretches(num_images: int, edges: IntArray, p: NDArray[np.float64]) -> sp.c
 
 
 def _split_disconnected(num_images: int, edges: IntArray, labels: IntArray) -> IntArray:
-    """Edges of one stretch by chance in different places are different components."""
+    """Split groups of edges with equal stretch into connected components."""
     count = int(labels.max()) + 1
     nodes = labels[:, None] * num_images + edges
     unique, rows = np.unique(nodes, return_inverse=True)
@@ -173,7 +175,7 @@ def _split_disconnected(num_images: int, edges: IntArray, labels: IntArray) -> I
 
 
 def _numbered_by_images(num_images: int, edges: IntArray, labels: IntArray) -> IntArray:
-    """Relabel so that 0 is the component with most images; ties by the first edge."""
+    """Relabel components by decreasing number of images; ties by the first edge."""
     used = np.unique(np.concatenate([labels * num_images + edges[:, 0], labels * num_images + edges[:, 1]]))
     names, first, compact = np.unique(labels, return_index=True, return_inverse=True)
     sizes = np.bincount(np.searchsorted(names, used // num_images), minlength=len(names))

@@ -1,4 +1,4 @@
-"""Stage 1 of the solver: rotations of a connected part, and which pairs they contradict."""
+"""Stage 1 of the solver: rotation averaging of a connected part, and removal of outlier pairs."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +18,18 @@ from colmap_vg.solver.state import SolverState
 Array = NDArray[np.float64]
 
 CLEAR_LEAD = 1.0 / 3.0
-"""Over any other solution of the rotations, as a share of the matches that agree with one of the two alone: the other
-has less than half as many of them. On 400 graphs of objects that repeat themselves folded solutions led by 0.33 at
-most, nearly all by less than 0.1, and 19 in 20 of those that were right by more than this."""
+"""Least lead over any other solution of the rotations that is not doubtful, as a share of the matches that agree with
+exactly one of the two: the other then has less than half as many of them. On 400 graphs of objects that repeat
+themselves, folded solutions led by at most 0.33, nearly all by less than 0.1; 19 in 20 correct ones led by more."""
 TRIAL_SHARE = 0.25
-"""Share of the rotation gate that pairs on trial must keep within: one false pair in 10^5 does, by chance."""
+"""Threshold for admitting uncalibrated pairs, as a share of the rotation gate; one false pair in 10^5 passes by
+chance."""
 
 
 def average_rotations(
     state: SolverState, part: Subgraph, options: SolveOptions, initial: Array
 ) -> tuple[Array, Subgraph]:
-    """Rotations of the part's images, and the part that the rotation gate leaves; gated until no edge goes."""
+    """Average rotations and drop edges beyond the rotation gate until none is left; return rotations and the part."""
     graph, start = state.graph, initial if np.isfinite(initial).all() else None
     while part.num_images >= 2:
         relative = graph.cam2_from_cam1_rotations[part.edge_rows]
@@ -48,7 +49,7 @@ def average_rotations(
             rotations, log = found.cam_from_world_rotations, found.log
             _doubt_rival(state, part, found)
         else:
-            # They were given, or found: the gate has only taken away what disagrees.
+            # Given rotations, or those of the last round, of which the gate has only removed disagreeing edges.
             likelihoods = edge_likelihoods(graph, part.edge_rows)
             rotations, log = refine_rotations(part.num_images, part.edges, relative, likelihoods, weights, start)
         bad = rotation_residuals(part.edges, relative, rotations) > np.radians(options.rotation_gate_deg)
@@ -67,7 +68,7 @@ def average_rotations(
 
 
 def admit_confirmed_pairs(state: SolverState, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:
-    """The part with those uncalibrated pairs besides whose rotations the averaged ones confirm."""
+    """Add the uncalibrated pairs whose rotations agree with the averaged ones; return the part with them."""
     if options.rotation_gate_deg == 0.0:
         return part
     graph, inside = state.graph, np.zeros(state.graph.num_images, dtype=bool)
@@ -79,7 +80,7 @@ def admit_confirmed_pairs(state: SolverState, part: Subgraph, rotations: Array, 
 
 
 def _doubt_rival(state: SolverState, part: Subgraph, found: ConsensusRotations) -> None:
-    """Note other solutions of the rotations, and say where one agrees with nearly as many matches."""
+    """Record alternative rotations, and mark images in doubt if one agrees with nearly as many matches."""
     if found.rivals:
         state.note_arrangements(part, (found.cam_from_world_rotations, *found.rivals))
     if found.lead >= CLEAR_LEAD:
@@ -90,21 +91,21 @@ def _doubt_rival(state: SolverState, part: Subgraph, found: ConsensusRotations) 
     state.doubt(
         images,
         "Another arrangement of the images agrees with nearly as many matches: the scene may repeat itself, and the"
-        f" model may be folded. It places {len(images)} of {part.num_images} images otherwise ({shown}).",
+        f" model may be folded. The poses of {len(images)} of {part.num_images} images differ in it ({shown}).",
     )
 
 
 def _certify_rotations(
     state: SolverState, part: Subgraph, relative: Array, rotations: Array, weights: Array, options: SolveOptions
 ) -> None:
-    """Log the smallest eigenvalue of the dual certificate, and say in a caveat what it tells."""
+    """Log the smallest eigenvalue of the dual certificate, and add its interpretation to the caveats."""
     if options.rotation_averaging != "chordal":
-        state.caveats.append("The rotations are not certified: certificates are for rotation_averaging='chordal'.")
+        state.caveats.append("The rotations are not certified: certificates need rotation_averaging='chordal'.")
         return
     found = certify_chordal(part.num_images, part.edges, relative, rotations, weights)
     state.log.append(LogEntry("certificate", 0, found.lower_bound, found.smallest_eigenvalue))
-    told = "are the global optimum" if found.is_global else "may not be the global optimum"
+    verdict = "are the global optimum" if found.is_global else "may not be the global optimum"
     state.caveats.append(
-        f"The chordal rotations of {part.num_images} images {told}: the certificate's smallest eigenvalue is "
-        f"{found.smallest_eigenvalue:.3g}, and no rotations cost less than {1.0 - found.relative_gap:.6f} of theirs."
+        f"The chordal rotations of {part.num_images} images {verdict}: the certificate's smallest eigenvalue is "
+        f"{found.smallest_eigenvalue:.3g}, and any rotations cost at least {1.0 - found.relative_gap:.6f} of theirs."
     )

@@ -1,14 +1,15 @@
-"""From a viewing graph to poses: the chain of rotation averaging, outlier filters, positions and refinement.
+"""Solver of viewing graphs: rotation averaging, outlier filters, positions and refinement.
 
 Nasiri, Hosseini, Moradi, "Solving Viewing Graph Optimization for Simultaneous Position and Rotation Registration",
-Alg. 1 and 2, between a robust front (rotation gate, direction filter, rigidity) and, by default, the epipolar
-adjustment behind them. Each stage works on the part of the graph that is still solvable; what leaves gets a verdict.
+Alg. 1 and 2, after outlier filters (rotation gate, direction filter, parallel rigidity) and, by default, followed by
+the epipolar adjustment. Each stage works on the part of the graph that is still solvable; removed images and edges get
+a verdict.
 
-1. :mod:`~colmap_vg.solver.rotation_stage` averages rotations, and drops pairs that contradict them.
-2. :mod:`~colmap_vg.solver.direction_stage` keeps the part whose positions its pairs fix, and drops directions that
-   contradict the rest.
-3. :mod:`~colmap_vg.solver.position_stage` places the cameras.
-4. :mod:`~colmap_vg.solver.adjustment_stage` adjusts them to all matches, and drops what contradicts them then.
+1. :mod:`~colmap_vg.solver.rotation_stage` averages rotations and drops outlier pairs.
+2. :mod:`~colmap_vg.solver.direction_stage` selects the part whose positions are determined and drops outlier
+   directions.
+3. :mod:`~colmap_vg.solver.position_stage` solves for positions.
+4. :mod:`~colmap_vg.solver.adjustment_stage` adjusts all cameras to the matches and drops remaining outlier pairs.
 """
 
 import numpy as np
@@ -36,21 +37,21 @@ Array = NDArray[np.float64]
 def solve_view_graph(
     graph: ViewGraph, options: SolveOptions | None = None, initial_rotations: ArrayLike | None = None
 ) -> PoseSolution:
-    """Solve all rotations and positions of those parts, of three images or more, that directions and tracks fix.
+    """Solve for the rotations and positions of all parts of three or more images that the graph determines.
 
     Parameters
     ----------
     graph : ViewGraph
     options : SolveOptions, optional
     initial_rotations : (n, 3, 3) array, optional
-        cam_from_world rotations that averaging refines in place of searching for them. Where they are not finite for
-        all images of a part, that part is searched. Robust averaging only.
+        cam_from_world rotations that are refined instead of averaging from scratch. They are ignored for a part if they
+        are not finite for all its images. Robust averaging only.
 
     Returns
     -------
     PoseSolution
-        In the graph's order of images and edges, the largest part as component 0. An unsolvable graph gives a
-        solution with no registered image, status ``unsolvable`` and the reason in its message.
+        In the graph's order of images and edges; the largest part is component 0. For an unsolvable graph no image is
+        registered, the status is ``unsolvable`` and the message gives the reason.
     """
     options = SolveOptions.given(options)
     state = SolverState(graph)
@@ -59,13 +60,13 @@ def solve_view_graph(
     while True:
         part = state.largest_component(unsolved, ImageVerdict.SMALLER_COMPONENT)
         if part.num_images < MIN_PART_IMAGES:
-            state.leave_out(part, ImageVerdict.SMALLER_COMPONENT)
+            state.remove_images(part, ImageVerdict.SMALLER_COMPONENT)
             return state.solution()
         solved, poses = _solve_part(state, part, options, initial[part.images])
         if poses is None:
-            state.leave_out(solved, ImageVerdict.NOT_RIGID)
+            state.remove_images(solved, ImageVerdict.NOT_RIGID)
         else:
-            state.place(
+            state.record_poses(
                 solved,
                 poses.rotations,
                 poses.centers,
@@ -80,7 +81,7 @@ def solve_view_graph(
 def _solve_part(
     state: SolverState, part: Subgraph, options: SolveOptions, initial: Array
 ) -> tuple[Subgraph, PartPoses | None]:
-    """The stages in turn, on a connected part; the images that are solved, or that no three fix, and then no poses."""
+    """Run all stages on a connected part; return the solved subgraph with poses, or the unsolvable part and None."""
     rotations, connected = average_rotations(state, part, options, initial)
     connected = admit_confirmed_pairs(state, connected, rotations, options)
     fixed = filter_directions(state, connected, rotations, options)
@@ -100,7 +101,7 @@ def _solve_part(
 
 
 def _initial_rotations(graph: ViewGraph, given: ArrayLike | None) -> Array:
-    """Given rotations as an array; NaN where none are."""
+    """Given rotations as an array, NaN if None."""
     shape = (graph.num_images, 3, 3)
     if given is None:
         return np.full(shape, np.nan)

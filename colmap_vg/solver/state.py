@@ -1,4 +1,4 @@
-"""State of a solve: verdicts on images and edges so far, the poses placed, and the iteration log."""
+"""State of a solve: current verdicts on images and edges, solved poses, and the iteration log."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,14 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MIN_PART_IMAGES = 3
-"""Of a part that is solved: two images have no more than a direction between them."""
+"""Minimum number of images of a solved part: two images determine only a direction."""
 MIN_AGREEMENT = 0.65
-"""Share of inlier matches below which a model is doubtful. Right models of objects that repeat themselves had 0.74 to
-0.95, those of other photographs 0.98 and more; models that were folded 0.64 to 0.86."""
+"""Share of inlier matches that agree below which a model is doubtful. Correct models of objects that repeat themselves
+had 0.74 to 0.95, those of other photographs 0.98 and more; folded models 0.64 to 0.86."""
 
 
 class SolverState:
-    """Verdicts on a graph's images and edges, starting from those given on reading.
+    """Verdicts on a graph's images and edges, initialised with those from reading, and poses solved so far.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class SolverState:
     image_verdicts : (n,) object array of ImageVerdict
     log : list of LogEntry
     caveats : list of str
-        Sentences on what could not be had in full.
+        Sentences on limitations of the solution.
     """
 
     def __init__(self, graph: ViewGraph) -> None:
@@ -59,43 +59,43 @@ class SolverState:
 
     @property
     def usable(self) -> BoolArray:
-        """Edges that no test has dropped so far, (m,)."""
+        """Mask (m,) of the edges that no test has dropped."""
         return np.isin(self.edge_verdicts.astype(str), [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
 
     @property
     def trusted(self) -> BoolArray:
-        """Edges that no test may drop, (m,)."""
+        """Mask (m,) of the edges that no test may drop."""
         return np.zeros(self.graph.num_edges, dtype=bool) if self.graph.trusted is None else self.graph.trusted
 
     def drop(self, edge_rows: IntArray, verdict: EdgeVerdict) -> None:
-        """Drop edges for a reason, but for trusted ones."""
+        """Drop edges with a verdict, except trusted ones."""
         self.edge_verdicts[edge_rows[~self.trusted[edge_rows]]] = verdict
 
     def restore(self, edge_rows: IntArray) -> None:
-        """Take dropped edges back."""
+        """Restore dropped edges."""
         self.edge_verdicts[edge_rows] = EdgeVerdict.KEPT
 
     def note_arrangements(self, part: Subgraph, rotations: tuple[Array, ...]) -> None:
-        """Note rotations (k, 3, 3) of a part, those found and others; of several parts the first, the largest."""
+        """Record the solved and alternative rotations (k, 3, 3) of a part; only of the first part, the largest."""
         if not self._arrangements:
             for own in rotations:
                 self._arrangements.append(np.full((self.graph.num_images, 3, 3), np.nan))
                 self._arrangements[-1][part.images] = own
 
-    def doubt(self, images: IntArray, told: str) -> None:
-        """Note images whose place is in doubt, and why, in a sentence."""
+    def doubt(self, images: IntArray, reason: str) -> None:
+        """Mark images whose pose is in doubt, with the reason as a sentence."""
         if self._in_doubt is None:
             self._in_doubt = np.zeros(self.graph.num_images, dtype=bool)
         self._in_doubt[images] = True
-        self.caveats.append(told)
+        self.caveats.append(reason)
 
-    def leave_out(self, part: Subgraph, verdict: ImageVerdict) -> None:
-        """Leave out the images of a part for a reason, but for those that have one."""
+    def remove_images(self, part: Subgraph, verdict: ImageVerdict) -> None:
+        """Give the images of a part a verdict, except those that were removed earlier."""
         in_question = self.image_verdicts[part.images] == ImageVerdict.REGISTERED
         self.image_verdicts[part.images[in_question]] = verdict
 
     def largest_component(self, images: BoolArray, otherwise: ImageVerdict) -> Subgraph:
-        """Largest connected component among the images marked; the others of them that had edges get the verdict."""
+        """Largest connected component of the marked images; the others of them that had edges get the verdict."""
         edges = self.usable & images[self.graph.edges].all(axis=1)
         linked = np.zeros(self.graph.num_images, dtype=bool)
         linked[self.graph.edges[edges].ravel()] = True
@@ -107,11 +107,11 @@ class SolverState:
         return Subgraph.of(self.graph.edges, inside, edges)
 
     def note_ratios(self, edge_rows: IntArray) -> None:
-        """Note pairs (q, 2) of the graph's edges with a firm ratio of lengths, in place of earlier ones."""
+        """Record the pairs (q, 2) of the graph's edges with a reliable ratio of lengths, replacing earlier ones."""
         self._ratios = edge_rows
 
     def largest_rigid_part(self, part: Subgraph, seed: int) -> Subgraph:
-        """Largest part that directions and ratios of lengths fix; the part's other images become ``not_rigid``."""
+        """Largest part that directions and length ratios determine; the part's other images become ``not_rigid``."""
         directed = self.edge_verdicts[part.edge_rows] == EdgeVerdict.KEPT
         row = np.full(self.graph.num_edges, -1, dtype=np.int64)
         row[part.edge_rows[directed]] = np.arange(int(directed.sum()))
@@ -126,16 +126,16 @@ class SolverState:
         kept[part.edge_rows[directed][edges]] = True
         return Subgraph.of(self.graph.edges, inside, kept)
 
-    def without(self, part: Subgraph, leaving: BoolArray, verdict: ImageVerdict, seed: int) -> Subgraph:
-        """The largest parallel-rigid part after some of a part's images (k,) have left for a reason."""
-        self.image_verdicts[part.images[leaving]] = verdict
-        staying = np.zeros(self.graph.num_images, dtype=bool)
-        staying[part.images[~leaving]] = True
+    def without(self, part: Subgraph, removed: BoolArray, verdict: ImageVerdict, seed: int) -> Subgraph:
+        """Remove some of a part's images (k,) with a verdict; return the largest parallel-rigid part of the others."""
+        self.image_verdicts[part.images[removed]] = verdict
+        remaining = np.zeros(self.graph.num_images, dtype=bool)
+        remaining[part.images[~removed]] = True
         kept = np.zeros(self.graph.num_edges, dtype=bool)
         kept[part.edge_rows] = True
-        return self.largest_rigid_part(Subgraph.of(self.graph.edges, staying, kept), seed)
+        return self.largest_rigid_part(Subgraph.of(self.graph.edges, remaining, kept), seed)
 
-    def place(
+    def record_poses(
         self,
         part: Subgraph,
         rotations: Array,
@@ -145,7 +145,7 @@ class SolverState:
         covariances: tuple[Array, Array] | None = None,
         radial_terms: Array | None = None,
     ) -> None:
-        """Take down the poses of a part as a component of its own; centroid 0, root mean square distance 1.
+        """Record the poses of a part as a new component, normalised to centroid 0 and root mean square distance 1.
 
         `covariances` are those of the centres and of the rotations, (k, 3, 3) each.
         """
@@ -161,7 +161,7 @@ class SolverState:
         self._component[part.images] = self._component.max(initial=-1) + 1
         self._converged &= converged
         if self.graph.camera_idx is not None:
-            # A camera of two components keeps what the larger one found.
+            # A camera of two components keeps the values from the larger one.
             cameras = np.zeros(len(focal_scales), dtype=bool)
             cameras[self.graph.camera_idx[part.images]] = True
             own = cameras & ~self._seen_cameras
@@ -171,7 +171,7 @@ class SolverState:
             self._seen_cameras |= cameras
 
     def solution(self) -> PoseSolution:
-        """What was placed, in the graph's order; unsolvable when nothing was."""
+        """Solution with all recorded poses, in the graph's order; unsolvable if there are none."""
         component = self._component
         if component.max(initial=-1) >= 0:
             sizes = np.bincount(component[component >= 0])
@@ -182,14 +182,14 @@ class SolverState:
         self.image_verdicts[component > 0] = ImageVerdict.OTHER_MODEL
         ends = component[self.graph.edges]
         inside = (ends[:, 0] >= 0) & (ends[:, 0] == ends[:, 1])
-        # What only told rotations keeps its word: that may be why its images are outside.
+        # Edges used for rotations only keep their verdict, which may be the reason why their images are outside.
         self.edge_verdicts[(self.edge_verdicts == EdgeVerdict.KEPT) & ~inside] = EdgeVerdict.OUTSIDE
         agreement = pair_agreement(self.graph, self._R, self._p, component)
         in_doubt = self._in_doubt is not None and bool((self._in_doubt & (component >= 0)).any())
         status, message = described(self.image_verdicts, self._converged, agreement, in_doubt)
         still = int((self.edge_verdicts == EdgeVerdict.ROTATION_ONLY).sum())
         if status == SolutionStatus.UNSOLVABLE and still:
-            message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have turned on the spot."
+            message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have rotated without moving."
         return PoseSolution(
             image_ids=self.graph.image_ids,
             cam_from_world_rotations=self._R,
@@ -218,19 +218,19 @@ class SolverState:
 def described(
     image_verdicts: NDArray[np.generic], converged: bool, agreement: tuple[Agreement, ...], in_doubt: bool
 ) -> tuple[SolutionStatus, str]:
-    """Status of a solution, and the sentences that tell it."""
+    """Status of a solution, and the message that explains it."""
     words, counts = np.unique(image_verdicts.astype(str), return_counts=True)
     elsewhere = {str(w): int(c) for w, c in zip(words, counts, strict=True) if w != ImageVerdict.REGISTERED}
     if sum(elsewhere.values()) == len(image_verdicts):
         return SolutionStatus.UNSOLVABLE, (
-            "No three images are linked by directions or tracks that fix their positions: "
+            "No three images are linked by directions or tracks that determine their positions: "
             "add overlapping photographs, taken from different places."
         )
     status, message = SolutionStatus.SOLVED, f"All {len(image_verdicts)} images are registered."
     if elsewhere:
         reasons = ", ".join(f"{count} {word}" for word, count in elsewhere.items())
         status = SolutionStatus.PARTIAL
-        message = f"{sum(elsewhere.values())} of {len(image_verdicts)} images are left out of the largest model"
+        message = f"{sum(elsewhere.values())} of {len(image_verdicts)} images are not in the largest model"
         message += f" ({reasons}); see image_verdicts."
     if not converged:
         status = SolutionStatus.NOT_CONVERGED
@@ -249,7 +249,7 @@ def described(
 
 
 def num_cameras(graph: ViewGraph) -> int:
-    """Number of cameras that a graph tells of; 0 when it tells of none."""
+    """Number of cameras of a graph; 0 if it has no camera data."""
     if graph.camera_focal_lengths is not None:
         return len(graph.camera_focal_lengths)
     return 0 if graph.camera_idx is None or len(graph.camera_idx) == 0 else int(graph.camera_idx.max()) + 1

@@ -1,4 +1,4 @@
-"""What each edge knows: relative poses refined on their inliers, with 5-DoF information matrices, all edges at once.
+"""Nonlinear refinement of the relative poses of all edges on their inliers, with 5-DoF information matrices.
 
 The robust Sampson error of edge k (see :mod:`colmap_vg.two_view.sampson`) is minimised over its rotation (3) and
 direction (2) by Levenberg-Marquardt, each edge with its own damping.
@@ -26,13 +26,13 @@ from colmap_vg.two_view.segments import segment_sums
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_MIN_SIGMA_PX = 0.02  # pixels; keypoints are not better than this, and exact data keep finite information
-_TOLERANCES = (1e-2, 1e-5, 1e-7)  # of each round's cost; the next round's scale makes more of a difference
+_MIN_SIGMA_PX = 0.02  # pixels; below the noise of real keypoints, and keeps the information of exact data finite
+_TOLERANCES = (1e-2, 1e-5, 1e-7)  # relative cost change, one per round; early rounds are redone at the next scale
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedEdges:
-    """Refined relative poses and what is known of them.
+    """Refined relative poses with their information matrices and residual statistics.
 
     Attributes
     ----------
@@ -67,17 +67,17 @@ def refine_relative_poses(
     *,
     num_iterations: int = 30,
 ) -> RefinedEdges:
-    """Minimise each edge's Cauchy Sampson error over its relative pose, and say how well it is known.
+    """Minimise the Cauchy Sampson error of each edge over its relative pose, and estimate its information matrix.
 
-    The Cauchy scale follows each edge's own median error, in three rounds. The information is the sandwich of an
-    M-estimator with one noise level per edge (Huber & Ronchetti, Robust Statistics, §7.6), so neither the robust
-    weights nor a wrong idea of the keypoint noise distort it. Pairs that share keypoints are still correlated with each
-    other.
+    The Cauchy scale follows the median error of each edge, in three rounds. The information is the inverse of the
+    sandwich covariance of an M-estimator with one noise level per edge (Huber & Ronchetti, Robust Statistics, §7.6), so
+    it depends neither on the robust weights nor on an assumed keypoint noise. Correlations between pairs that share
+    keypoints are not included.
 
     Parameters
     ----------
     offsets : (m + 1,) int array
-        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``; edges without matches stay as they are.
+        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``; edges without matches are returned unchanged.
     bearings1, bearings2 : (k, 3) array
         Unit rays of the matches.
     rotations : (m, 3, 3) array
@@ -110,7 +110,7 @@ def refine_relative_poses(
 def _levenberg(
     matches: Matches, R: Array, d: Array, scale: Array, num_iterations: int, tolerance: float
 ) -> tuple[Array, Array]:
-    """Levenberg-Marquardt at a fixed Cauchy scale (m,) in pixels; edges leave when their cost stands still."""
+    """Levenberg-Marquardt at a fixed Cauchy scale (m,) in pixels; each edge stops when its own cost has converged."""
     R, d = R.copy(), d.copy()
     damping = np.full(len(R), 1e-4)
     active = np.arange(len(R))
@@ -119,10 +119,10 @@ def _levenberg(
         at = normal_equations(at_work, R[active], d[active], scale[active])
         cost, gradient, hessian = at.costs, at.gradients, at.newton_hessians
         diagonal = np.einsum("maa->ma", hessian)
-        # Marquardt's scaling, with a floor so that a direction that no match sees stays where it is.
+        # Marquardt's scaling, with a floor so that a direction that no match constrains does not change.
         level = damping[active, None] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-30
         step = -np.linalg.solve(hessian + level[:, :, None] * np.eye(5), gradient[:, :, None])[:, :, 0]
-        # Beyond a radian the linearisation says nothing.
+        # The linearisation is not valid beyond a radian.
         step = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1.0)
         new_R, new_d = moved(R[active], d[active], step)
         new_cost = cauchy_costs(at_work, new_R, new_d, scale[active])

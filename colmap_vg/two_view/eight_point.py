@@ -1,9 +1,9 @@
-"""Essential and fundamental matrices of all edges from their matches alone, by robust linear estimation.
+"""Robust linear estimation of essential and fundamental matrices from the matches of all edges.
 
 The eight-point algorithm on the 9x9 moments ``M = sum w (x2 ⊗ x1)(x2 ⊗ x1)^T`` of each edge. Normalisation
-(Hartley, In defense of the eight-point algorithm, 1997) is a whitening of each side, applied to the moments instead of
-the points. Weights are those of the Sampson distance times a Cauchy weight, as in iteratively reweighted algebraic
-fitting (Hartley & Zisserman §11.4.3).
+(Hartley, In defense of the eight-point algorithm, 1997) whitens both sides of the moments instead of the points. The
+weight of a match is the Cauchy weight of its Sampson distance over the variance of its algebraic error, as in
+iteratively reweighted algebraic fitting (Hartley & Zisserman §11.4.3).
 """
 
 import numpy as np
@@ -18,14 +18,14 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _MIN_MATCHES = 8
-_NUM_RANK_STEPS = 3  # Newton steps to determinant zero; it converges quadratically
+_NUM_RANK_STEPS = 3  # Newton steps towards determinant zero; convergence is quadratic
 
 
 def matrix_of_least_moment(moments: Array, *, rank_two: bool = False) -> Array:
     """Matrices of unit norm that minimise ``vec(E)^T M vec(E)`` after whitening both sides: (m, 9, 9) to (m, 3, 3).
 
-    With `rank_two` they are moved to determinant zero where that costs least by M, and not to the nearest in norm:
-    steps ``-det A^-1 c / (c^T A^-1 c)``, c the cofactors.
+    With `rank_two` the determinant is made zero at the least increase of the cost M, not at the least change in norm,
+    by steps ``-det A^-1 c / (c^T A^-1 c)`` with the cofactors c.
     """
     by_side = moments.reshape(-1, 3, 3, 3, 3)
     whiten2 = _inverse_root(np.einsum("mijkj->mik", by_side))
@@ -35,14 +35,14 @@ def matrix_of_least_moment(moments: Array, *, rank_two: bool = False) -> Array:
     _, vectors = np.linalg.eigh(whitened)
     e = vectors[:, :, 0]
     if rank_two:
-        # Along e itself M is nearly zero, but only e's scale would change: that direction is closed.
+        # M is nearly zero along e itself, but a step along e would only change its scale: block that direction.
         level = np.trace(whitened, axis1=1, axis2=2)[:, None, None]
         inverse = np.linalg.inv(whitened + level * (e[:, :, None] * e[:, None, :] + 1e-12 * np.eye(9)))
         for _ in range(_NUM_RANK_STEPS):
             c = cofactors(e.reshape(-1, 3, 3)).reshape(-1, 9)
             cheapest = np.einsum("mab,mb->ma", inverse, c)
             slope, det = np.einsum("ma,ma->m", c, cheapest), np.linalg.det(e.reshape(-1, 3, 3))
-            # Longer than e itself: matches that are all one match say nothing of the determinant.
+            # No step that is longer than e itself: identical matches do not constrain the determinant.
             sane = slope > np.abs(det) * np.linalg.norm(cheapest, axis=1)
             e = e - np.where(sane, det / np.where(sane, slope, 1.0), 0.0)[:, None] * cheapest
     # (W2 x2)^T E' (W1 x1) = x2^T (W2 E' W1) x1, W symmetric.
@@ -64,20 +64,21 @@ def estimate_essential_from_inliers(
     num_iterations: int = 10,
     min_scale: float = 2e-4,
 ) -> Array:
-    """Robust essential matrix of each edge from its matches, with or without a matrix to start from.
+    """Estimate a robust essential matrix for each edge from its matches and an optional initial matrix.
 
-    Meant for verified matches: from nothing it bears a few percent of gross outliers (at 5 % the rotations of 9 edges
-    in 10 came out within 0.1°), from a given matrix far more.
+    Intended for verified matches. Without an initial matrix a few percent of gross outliers are tolerated (at 5 % the
+    rotations of 9 edges in 10 were within 0.1°), with one far more.
 
     Parameters
     ----------
     offsets : (m + 1,) int array
+        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``.
     bearings1, bearings2 : (k, 3) array
         Unit rays.
     initial : (m, 3, 3) array, optional
-        Essential matrices that give the first weights; equal weights where missing.
+        Essential matrices from which the first weights are computed. Default: equal weights.
     num_iterations : int
-        Reweighting rounds.
+        Number of reweighting iterations.
     min_scale : float
         Floor of the Cauchy scale, radians; above it the scale is twice the median error.
 
@@ -99,7 +100,7 @@ def estimate_fundamental_from_inliers(
     num_iterations: int = 10,
     min_scale: float = 0.3,
 ) -> Array:
-    """Robust fundamental matrix of each edge from its matches in pixels.
+    """Estimate a robust fundamental matrix for each edge from its matches in pixels.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ def estimate_fundamental_from_inliers(
     (m, 3, 3) array
         Rank two, unit norm, ``x2^T F x1 = 0``; NaN or `initial` for edges with fewer than eight matches.
     """
-    # Pixels reach 1e4, their products 1e16: bring all points to about 1 first, one scale for all edges.
+    # Pixel coordinates reach 1e4, fourth-order moments 1e16: scale all points to about 1, by one factor for all edges.
     size = max(float(np.abs(points1).max(initial=1.0)), float(np.abs(points2).max(initial=1.0)))
     shrink = np.diag([1.0 / size, 1.0 / size, 1.0])
     grow = np.diag([size, size, 1.0])
@@ -174,7 +175,7 @@ def weighted_moments(pieces: Pieces, weights: Array) -> Array:
 
 
 def _sampson_weights(E: Array, pieces: Pieces, min_scale: float, on_sphere: bool) -> Array:
-    """Cauchy weights of the Sampson errors over their variances: (p, length)."""
+    """Cauchy weights of the Sampson errors, divided by the variances of the algebraic errors: (p, length)."""
     squared, variance = np.empty((2, len(pieces.counts), pieces.columns.shape[2]))
     for block in pieces.blocks():
         columns, E_of = pieces.columns[block.pieces], E[pieces.segments[block.pieces]]
@@ -185,8 +186,8 @@ def _sampson_weights(E: Array, pieces: Pieces, min_scale: float, on_sphere: bool
         if on_sphere:
             spread += np.square(line1[:, 2]) + np.square(line2[:, 2]) - 2.0 * algebraic
         squared[block.pieces], variance[block.pieces] = algebraic, spread
-    # A match beside both epipoles fits whatever its error: without a floor its weight would grow beyond all others.
-    # Where all keypoints are one, only the last term keeps the moments finite.
+    # The variance of a match near both epipoles vanishes: without a floor its weight would exceed all others.
+    # Where all keypoints coincide, only the last term keeps the moments finite.
     offsets = pieces.offsets
     typical = segment_sums(offsets, pieces.rows(variance)) / np.maximum(np.diff(offsets), 1)
     variance = np.maximum(variance, 1e-2 * typical[pieces.segments, None] + 1e-60)

@@ -1,6 +1,6 @@
-"""Essential and fundamental matrices of all edges: conversion, Sampson errors, and the pose that cheirality chooses.
+"""Essential and fundamental matrices of all edges: conversion, Sampson errors, and relative poses by cheirality.
 
-With ``cam2_from_cam1 = (R, t)`` a match obeys ``x2^T E x1 = 0``, ``E = [t]_x R = -R [d]_x``, where
+With ``cam2_from_cam1 = (R, t)`` a match satisfies ``x2^T E x1 = 0``, ``E = [t]_x R = -R [d]_x``, where
 ``d = -R^T t`` is the direction of camera 2's centre in camera 1's frame (Hartley & Zisserman, Multiple View Geometry,
 §9.6).
 """
@@ -21,7 +21,7 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class RelativePoses:
-    """Relative poses of m edges and how their matches lie to them.
+    """Relative poses of m edges, with cheirality counts and triangulation angles.
 
     Attributes
     ----------
@@ -30,9 +30,9 @@ class RelativePoses:
     directions : (m, 3) array
         Unit directions of camera 2's centre in camera 1's frame.
     num_in_front : (m,) int64 array
-        Matches whose rays meet in front of both cameras.
+        Number of matches whose rays meet in front of both cameras.
     share_in_front : (m,) array
-        The same over all matches of the edge; 0 for edges without matches.
+        Their share of all matches of the edge; 0 for edges without matches.
     median_angles : (m,) array
         Median angle between the two rays of the matches in front, radians; 0 where there are none.
     """
@@ -44,11 +44,11 @@ class RelativePoses:
     median_angles: Array
 
     def of(self, edges: IntArray) -> "RelativePoses":
-        """Those of some edges, in their order."""
+        """Relative poses of the given edges, in the given order."""
         return RelativePoses(*(getattr(self, f.name)[edges] for f in fields(self)))
 
     def replaced(self, edges: IntArray, others: "RelativePoses") -> "RelativePoses":
-        """The same with other poses for some edges (e,)."""
+        """Copy with the poses of the given edges (e,) replaced."""
         columns = [getattr(self, f.name).copy() for f in fields(self)]
         for column, f in zip(columns, fields(self), strict=True):
             column[edges] = getattr(others, f.name)
@@ -56,12 +56,12 @@ class RelativePoses:
 
 
 def essential_from_pose(rotations: Array, directions: Array) -> Array:
-    """``E = -R [d]_x`` of relative rotations (m, 3, 3) and directions (m, 3), both singular values 1: (m, 3, 3)."""
+    """Essential matrices ``E = -R [d]_x``, singular values (1, 1, 0), of rotations (m, 3, 3) and directions (m, 3)."""
     return np.asarray(-rotations @ so3.hat(directions))
 
 
 def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
-    """``E = K2^T F K1``, of unit Frobenius norm; the singular values are left as they are.
+    """Matrices ``E = K2^T F K1`` of unit Frobenius norm; the singular values are not equalised.
 
     Parameters
     ----------
@@ -93,16 +93,17 @@ def sampson_errors(
     focal_lengths1: Array | None = None,
     focal_lengths2: Array | None = None,
 ) -> Array:
-    """Signed first-order distance of each match from its epipolar constraint, on the unit sphere.
+    """Signed Sampson error of each match, the first-order distance from its epipolar constraint on the unit sphere.
 
-    ``x2^T E x1 / sqrt(|P1 E^T x2|^2 / f1^2 + |P2 E x1|^2 / f2^2)`` with ``P = I - x x^T`` the projection on the tangent
-    plane of a bearing, so that it serves lenses of any field of view.
+    ``x2^T E x1 / sqrt(|P1 E^T x2|^2 / f1^2 + |P2 E x1|^2 / f2^2)`` with the projection ``P = I - x x^T`` on the tangent
+    plane of a bearing, which is valid for any field of view.
 
     Parameters
     ----------
     E : (m, 3, 3) array
         Essential matrices, of any scale.
     offsets : (m + 1,) int array
+        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``.
     bearings1, bearings2 : (k, 3) array
         Unit rays.
     focal_lengths1, focal_lengths2 : (m,) array, optional
@@ -111,7 +112,7 @@ def sampson_errors(
     Returns
     -------
     (k,) array
-        Radians, or pixels when focal lengths are given. Zero for a match on both epipoles.
+        Radians, or pixels if focal lengths are given. Zero for a match at both epipoles.
     """
     edge = segment_of_rows(offsets)
     row_E = E[edge]
@@ -133,7 +134,7 @@ def sampson_errors(
 def in_front_of_both(
     rotations: Array, directions: Array, offsets: IntArray, bearings1: Array, bearings2: Array
 ) -> BoolArray:
-    """Whether the rays of each match meet (in least squares) in front of both cameras: (k,).
+    """Mask (k,) of the matches whose rays meet (in least squares) in front of both cameras.
 
     The depths that minimise ``|l1 R x1 + t - l2 x2|`` have the signs of ``c (b.t) - a.t`` and ``b.t - c (a.t)``, with
     ``a = R x1``, ``b = x2``, ``c = a.b``.
@@ -146,10 +147,10 @@ def in_front_of_both(
     return np.asarray((cosine * along2 > along1) & (along2 > cosine * along1))
 
 
-def judged_poses(
+def check_cheirality(
     rotations: Array, directions: Array, offsets: IntArray, bearings1: Array, bearings2: Array
 ) -> RelativePoses:
-    """Given relative poses (m, 3, 3), (m, 3) with their cheirality counts and triangulation angles."""
+    """Count the matches in front of both cameras, and their triangulation angles, for poses (m, 3, 3), (m, 3)."""
     edge = segment_of_rows(offsets)
     front = in_front_of_both(rotations, directions, offsets, bearings1, bearings2)
     num = segment_sums(offsets, front.astype(np.float64)).astype(np.int64)
@@ -160,15 +161,16 @@ def judged_poses(
 
 
 def poses_from_essential(E: Array, offsets: IntArray, bearings1: Array, bearings2: Array) -> RelativePoses:
-    """Of the four poses of each essential matrix, the one that most matches lie in front of.
+    """Decompose essential matrices into the one of four relative poses with most matches in front of both cameras.
 
-    Hartley & Zisserman §9.6.2. Ties (edges without matches, too) go to the first candidate.
+    Hartley & Zisserman §9.6.2. Ties, including edges without matches, go to the first candidate.
 
     Parameters
     ----------
     E : (m, 3, 3) array
-        Essential matrices of any scale and sign; unequal singular values are made equal.
+        Essential matrices of any scale and sign; unequal singular values are equalised.
     offsets : (m + 1,) int array
+        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``.
     bearings1, bearings2 : (k, 3) array
         Unit rays of the matches.
 
@@ -180,7 +182,7 @@ def poses_from_essential(E: Array, offsets: IntArray, bearings1: Array, bearings
     U = U * np.sign(np.linalg.det(U))[:, None, None]
     Vt = Vt * np.sign(np.linalg.det(Vt))[:, None, None]
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    # E is free of t's sign, and the null vector of E is the direction itself whichever of the rotations is taken.
+    # E does not determine the sign of t, and its null vector is the direction for both rotations.
     rotation_pair = (U @ quarter @ Vt, U @ quarter.T @ Vt)
     direction = Vt[:, 2, :]
     candidates = [(R, s * direction) for R in rotation_pair for s in (1.0, -1.0)]
@@ -193,4 +195,4 @@ def poses_from_essential(E: Array, offsets: IntArray, bearings1: Array, bearings
     best, rows = np.argmax(votes, axis=0), np.arange(len(E))
     R = np.stack([c[0] for c in candidates])[best, rows]
     d = np.stack([c[1] for c in candidates])[best, rows]
-    return judged_poses(R, d, offsets, bearings1, bearings2)
+    return check_cheirality(R, d, offsets, bearings1, bearings2)

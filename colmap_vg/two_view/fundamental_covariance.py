@@ -1,4 +1,4 @@
-"""How well the matches of each edge determine its fundamental matrix, for all edges at once.
+"""Covariance matrices of the fundamental matrices of all edges, from their matches.
 
 The Sampson cost is ``vec(F)^T M vec(F)`` with the weighted 9x9 moments M of the matches, so ``M / sigma^2`` is the
 information of F, restricted to the seven directions that change neither its norm nor its rank (Hartley & Zisserman
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.linear.robust_losses import cauchy_weight
+from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, MAD_TO_SIGMA, cauchy_weight
 from colmap_vg.two_view.eight_point import cofactors, weighted_moments
 from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import segment_quantiles
@@ -18,8 +18,7 @@ from colmap_vg.two_view.segments import segment_quantiles
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_CAUCHY_SCALE = 2.385  # of sigma
-_MIN_SIGMA_PX = 0.15  # where matches fit better, what the lens model leaves out is all there is
+_MIN_SIGMA_PX = 0.15  # pixels; below this the unmodelled distortion dominates the keypoint noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +28,7 @@ class FundamentalCovariances:
     Attributes
     ----------
     covariances : (m, 9, 9) array
-        Of the row-major ``vec(F)`` as F was given; rank seven.
+        Covariances of the row-major ``vec(F)`` in the scale of the given F; rank seven.
     sigmas_px : (m,) array
         Robust standard deviation of the Sampson error, corrected for the seven fitted parameters.
     """
@@ -52,8 +51,8 @@ def fundamental_covariances(
     F : (m, 3, 3) array
         Fitted fundamental matrices, ``x2^T F x1 = 0``, of rank two.
     max_effective_matches : float
-        What lens and keypoint model leave out does not average away with more matches: beyond this number further
-        matches add no information.
+        Largest number of matches that add information. Errors of the lens and keypoint models are systematic: they do
+        not average out over more matches.
 
     Returns
     -------
@@ -70,7 +69,7 @@ def fundamental_covariances(
     fixed, _ = np.linalg.qr(np.stack([unit.reshape(-1, 9), cofactors(unit).reshape(-1, 9)], axis=2))
     free = np.eye(9) - fixed @ np.swapaxes(fixed, 1, 2)
     level = np.trace(moments, axis1=1, axis2=2)[:, None, None]
-    # The relative floor bounds the covariance of directions that no match sees (planar pairs).
+    # The relative floor bounds the covariance of directions that no match constrains (planar pairs).
     inverse = np.linalg.inv(free @ moments @ free + level * (np.eye(9) - free) + 1e-13 * level * np.eye(9))
     back = (norm[:, None, None] / np.outer(grow, grow)).reshape(-1, 9)
     covariances = back[:, :, None] * (free @ inverse @ free) * back[:, None, :]
@@ -90,6 +89,6 @@ def _information(offsets: IntArray, points1: Array, points2: Array, F: Array, mi
     squared /= variance
     count = np.diff(offsets)
     median = np.sqrt(segment_quantiles(offsets, pieces.rows(squared)))
-    sigma = np.maximum(1.4826 * median * np.sqrt(count / np.maximum(count - 7, 1)), min_sigma)
-    weights = cauchy_weight(squared / np.square(_CAUCHY_SCALE * sigma)[pieces.segments, None]) / variance
+    sigma = np.maximum(MAD_TO_SIGMA * median * np.sqrt(count / np.maximum(count - 7, 1)), min_sigma)
+    weights = cauchy_weight(squared / np.square(EFFICIENT_CAUCHY * sigma)[pieces.segments, None]) / variance
     return weighted_moments(pieces, weights) / np.square(sigma)[:, None, None], sigma

@@ -1,8 +1,8 @@
-"""Rows of segments cut into pieces of one length, so that what belongs to a segment is broadcast and never gathered.
+"""Segments of rows cut into zero-padded pieces of equal length, so that values per segment broadcast over the rows.
 
-Matches of edges, and tracks of triplets, come as one long array with offsets. Cut into pieces of one length and padded
-with zeros they are arrays (pieces, length): what an edge gives all its matches is a column beside them, and sums of
-products over its matches are small matrix products. That is five times faster than repeating edges over their matches.
+Matches of edges and tracks of triplets are stored as one long array with offsets. Cut into pieces of equal length and
+padded with zeros, they form arrays (pieces, length): values per edge are columns that broadcast, and sums of products
+over the matches are small matrix products. This is five times faster than repeating values per edge for every match.
 """
 
 from collections.abc import Iterator
@@ -18,21 +18,21 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _LENGTHS = (8, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-_ROWS_PER_PIECE = 24  # rows that are computed in the time that a piece costs beside its rows
+_ROWS_PER_PIECE = 24  # overhead of a piece, expressed in rows that are computed in the same time
 ROWS_PER_BLOCK = 8192
-"""A column of 64 kB; the thirty of one block share the second-level cache."""
+"""Rows per block. A column has 64 kB; the thirty columns of a block fit in the second-level cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Rows of segments in pieces of one length.
+    """Rows of segments in zero-padded pieces of equal length.
 
     Attributes
     ----------
     starts : (m + 1,) int64 array
         Pieces of segment k are ``starts[k]:starts[k + 1]``.
     counts : (p,) int64 array
-        Rows in each piece; the rest of it is zero.
+        Number of rows in each piece; the remaining entries are zero.
     columns : (p, c, length) array
         Components of the rows.
     """
@@ -43,9 +43,9 @@ class Pieces:
 
     @classmethod
     def cut(cls, offsets: IntArray, columns: list[Array]) -> "Pieces":
-        """Cut rows ``offsets[k]:offsets[k + 1]`` of columns (k,) into pieces."""
+        """Cut columns (k,) into pieces; segment k is rows ``offsets[k]:offsets[k + 1]``."""
         count = np.diff(offsets)
-        # Ties go to the first, shorter length.
+        # The first, shorter length wins ties.
         length = min(_LENGTHS, key=lambda size: int((-(-count // size)).sum()) * (size + _ROWS_PER_PIECE))
         number = -(-count // length)
         starts = np.concatenate([[0], np.cumsum(number)]).astype(np.int64)
@@ -72,14 +72,14 @@ class Pieces:
         return np.concatenate([[0], np.cumsum(self.counts)])[self.starts].astype(np.int64)
 
     def of(self, segments: IntArray) -> "Pieces":
-        """Those of some segments, in their order."""
+        """Pieces of the given segments, in the given order."""
         if len(segments) == self.num_segments:
             return self
         pieces, starts = rows_of_segments(self.starts, segments)
         return Pieces(starts, self.counts[pieces], self.columns[pieces])
 
     def blocks(self, num_rows: int | None = None) -> Iterator["Block"]:
-        """Runs of whole segments of about so many rows."""
+        """Iterate over runs of whole segments with about `num_rows` rows each."""
         per_block = max((num_rows or ROWS_PER_BLOCK) // self.columns.shape[2], 1)
         first, last = 0, self.num_segments
         while first < last:
@@ -90,15 +90,18 @@ class Pieces:
             first = stop
 
     def rows(self, values: Array, block: "Block | None" = None) -> Array:
-        """Values (..., p, length) of all pieces, or of a block's, as rows (..., k) in their order."""
+        """Rows (..., k) in their original order from values (..., p, length) of all pieces, or of those of a block."""
         counts = self.counts if block is None else self.counts[block.pieces]
         return values[..., np.arange(values.shape[-1]) < counts[:, None]]
 
 
-def shrunk(rays: Array, factors: Array) -> Array:
-    """Rays (p, 3, length) with the first two coordinates multiplied by factors (p,), normalised; zeros stay zero."""
-    factors = factors[:, None]
-    result = rays * np.stack([factors, factors, np.ones_like(factors)], axis=1)
+def rescaled_rays(rays: Array, focal_ratios: Array) -> Array:
+    """Unit rays (p, 3, length) after their focal lengths are divided by `focal_ratios` (p,); zero padding stays zero.
+
+    The first two coordinates are multiplied by the ratio of the old to the new focal length.
+    """
+    ratios = focal_ratios[:, None]
+    result = rays * np.stack([ratios, ratios, np.ones_like(ratios)], axis=1)
     squared = np.einsum("pak,pak->pk", result, result)
     result /= np.sqrt(np.maximum(squared, np.finfo(np.float64).tiny))[:, None]
     return result
@@ -106,14 +109,22 @@ def shrunk(rays: Array, factors: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A run of whole segments: which, their pieces, and offsets of these from the first piece."""
+    """A run of whole segments.
+
+    Attributes
+    ----------
+    segments, pieces : slice
+        Segments of the run, and their pieces.
+    starts : (s + 1,) int64 array
+        Pieces of each segment, counted from the first piece of the run.
+    """
 
     segments: slice
     pieces: slice
     starts: IntArray
 
     def totals(self, values: Array) -> Array:
-        """Sums of pieces (p, ...) over their segments; zero for empty ones: (m, ...)."""
+        """Sums over each segment of values per piece (p, ...); zero for empty segments: (s, ...)."""
         filled = np.flatnonzero(np.diff(self.starts) > 0)
         totals = np.zeros((len(self.starts) - 1, *values.shape[1:]))
         if len(filled):

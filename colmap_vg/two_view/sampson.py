@@ -1,13 +1,14 @@
-"""Sampson errors of all edges' matches, their robust costs, and normal equations by what moves each edge.
+"""Sampson errors of the matches of all edges, their robust costs, and normal equations by the parameters of each edge.
 
-In the frame ``Q = [B, d]`` of camera 1, its third axis the direction d of camera 2's centre, with ``y = Q^T x1`` and
-``z = (R Q)^T x2`` for unit bearings x1, x2, the epipolar constraint and its variance under a pixel of noise are
+In the frame ``Q = [B, d]`` in camera 1, whose third axis is the direction d of camera 2's centre, with ``y = Q^T x1``
+and ``z = (R Q)^T x2`` for unit bearings x1, x2, the epipolar constraint and its variance under a pixel of noise are
 
     c = x2^T R [d]_x x1 = z_1 y_2 - z_2 y_1,    s^2 = (1 - y_3^2 - c^2) / f_2^2 + (1 - z_3^2 - c^2) / f_1^2,
 
 and the residual ``r = c / s`` is in pixels (Sampson error on the tangent planes of the bearings). Derivatives include
-those of s. An edge is moved by ``R <- R exp(Q w)``, ``d <- Q (tau, 1)`` normalised, and the logarithms of its two focal
-lengths: a longer focal draws a bearing x towards the axis, ``dx = x_3 (e_3 - x_3 x)``, and shrinks a pixel.
+those of s. The parameters of an edge are ``R <- R exp(Q w)``, ``d <- Q (tau, 1)`` normalised, and the logarithms of its
+two focal lengths: a longer focal length moves a bearing x towards the axis, ``dx = x_3 (e_3 - x_3 x)``, and reduces the
+angle of a pixel.
 """
 
 from collections.abc import Iterator
@@ -18,12 +19,12 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
-from colmap_vg.two_view.pieces import Block, Pieces, shrunk
+from colmap_vg.two_view.pieces import Block, Pieces, rescaled_rays
 from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-_MIN_SLOPE = 0.25  # share of the weights that is left where outliers have taken all
+_MIN_SLOPE = 0.25  # lower limit of the factor on the Hessian where outliers dominate, dimensionless
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,37 +34,38 @@ class Matches:
     Attributes
     ----------
     pieces : Pieces
-        Unit rays in image 1 and image 2, six columns.
+        Unit rays in image 1 and image 2: six columns.
     variances : (2, m) array
         ``1 / f^2`` of camera 1 and 2, squared radians per squared pixel.
-    shrinks : (2, m) array or None
-        Factors on the first two coordinates of the rays, which are then normalised: those of a longer focal length.
+    focal_ratios : (2, m) array or None
+        Old over new focal length of camera 1 and 2: the first two coordinates of the rays are multiplied by it, and the
+        rays normalised.
     """
 
     pieces: Pieces
     variances: Array
-    shrinks: Array | None = None
+    focal_ratios: Array | None = None
 
     @classmethod
     def of_rays(
         cls, offsets: IntArray, bearings1: Array, bearings2: Array, variances1: Array, variances2: Array
     ) -> "Matches":
-        """From unit rays (k, 3) of matches, those of edge k in rows ``offsets[k]:offsets[k + 1]``."""
+        """Create from unit rays (k, 3); the matches of edge k are rows ``offsets[k]:offsets[k + 1]``."""
         return cls(cut_rays(offsets, bearings1, bearings2), np.stack([variances1, variances2]))
 
     @property
     def counts(self) -> IntArray:
-        """Matches of each edge: (m,)."""
+        """Number of matches of each edge: (m,)."""
         return np.diff(self.pieces.offsets)
 
     def of(self, edges: IntArray) -> "Matches":
-        """The matches of some edges, in their order."""
-        shrinks = None if self.shrinks is None else self.shrinks[:, edges]
-        return Matches(self.pieces.of(edges), self.variances[:, edges], shrinks)
+        """Matches of the given edges, in the given order."""
+        focal_ratios = None if self.focal_ratios is None else self.focal_ratios[:, edges]
+        return Matches(self.pieces.of(edges), self.variances[:, edges], focal_ratios)
 
 
 def cut_rays(offsets: IntArray, bearings1: Array, bearings2: Array) -> Pieces:
-    """Pieces of matches' rays (k, 3) in image 1 and image 2."""
+    """Cut the rays (k, 3) of matches in image 1 and image 2 into pieces."""
     return Pieces.cut(offsets, [*bearings1.T, *bearings2.T])
 
 
@@ -71,7 +73,7 @@ def cut_rays(offsets: IntArray, bearings1: Array, bearings2: Array) -> Pieces:
 class NormalEquations:
     """Robust cost (m,), gradient (m, b) and Gauss-Newton Hessian (m, b, b) of each edge, squared pixels.
 
-    `slopes` (m,) are sums of the influence function's slopes over sums of weights.
+    `slopes` (m,) are sums of the derivatives of the influence function over sums of the weights.
     """
 
     costs: Array
@@ -81,8 +83,8 @@ class NormalEquations:
 
     @property
     def newton_hessians(self) -> Array:
-        """Hessians by slopes where those of reweighted least squares go by weights, which under plain noise makes half
-        of the step that it takes."""
+        """Hessians with derivatives of the influence function as weights. Those of reweighted least squares, with the
+        weights themselves, give about half the step under pure noise."""
         return self.hessians * np.maximum(self.slopes, _MIN_SLOPE)[:, None, None]
 
 
@@ -90,8 +92,8 @@ class NormalEquations:
 class SampsonDerivatives:
     """Residuals (k,) in pixels, with derivatives by (w, tau) and the log focals (b, k), and by the keypoints.
 
-    `by_ray1` and `by_ray2` (3, k) are tangent to the rays, in the frames of their cameras, per pixel of the keypoint's
-    noise; the noise's pull on s is left out, being of second order. Their squared norms sum to one.
+    `by_ray1` and `by_ray2` (3, k) are tangent to the rays, in the frames of their cameras, per pixel of keypoint noise.
+    The effect of the noise on s, of second order, is neglected. Their squared norms sum to one.
     """
 
     r: Array
@@ -101,13 +103,13 @@ class SampsonDerivatives:
 
 
 def frames(R: Array, d: Array) -> tuple[Array, Array]:
-    """``Q = [B, d]`` in camera 1's frame and the same axes ``R Q`` in camera 2's: (m, 3, 3) each."""
+    """Frames ``Q = [B, d]`` of edges in camera 1's frame, and the same axes ``R Q`` in camera 2's: (m, 3, 3) each."""
     Q = np.concatenate([tangent_basis(d), d[:, :, None]], axis=2)
     return Q, R @ Q
 
 
 def moved(R: Array, d: Array, step: Array) -> tuple[Array, Array]:
-    """Edges after a step (m, 5) of rotation and direction."""
+    """Relative rotations (m, 3, 3) and directions (m, 3) after a step (m, 5) of ``(w, tau)``."""
     Q, _ = frames(R, d)
     turned = R @ Q @ so3.exp(step[:, :3]) @ np.swapaxes(Q, 1, 2)
     along = np.concatenate([step[:, 3:], np.ones((len(d), 1))], axis=1)
@@ -115,7 +117,7 @@ def moved(R: Array, d: Array, step: Array) -> tuple[Array, Array]:
 
 
 def cauchy_costs(matches: Matches, R: Array, d: Array, scales: Array) -> Array:
-    """``sum s^2 log(1 + r^2 / s^2)`` of each edge, with its scale s (m,) in pixels: (m,)."""
+    """Cauchy costs ``sum s^2 log(1 + r^2 / s^2)`` of each edge, with its scale s (m,) in pixels: (m,)."""
     costs, squared_scales = np.zeros(len(R)), np.square(scales)
     for block, at in _by_block(matches, R, d):
         ratio = at.r * at.r / squared_scales[at.edge][:, None]
@@ -131,7 +133,7 @@ def median_errors(matches: Matches, R: Array, d: Array) -> Array:
 def normal_equations(
     matches: Matches, R: Array, d: Array, scales: Array, *, with_focals: bool = False
 ) -> NormalEquations:
-    """Cauchy costs and their normal equations by (w, tau), b = 5, and the two log focal lengths where asked, b = 7."""
+    """Cauchy costs and normal equations by (w, tau), b = 5, and `with_focals` the two log focal lengths, b = 7."""
     m, b, squared_scales = len(R), 7 if with_focals else 5, np.square(scales)
     costs, products, slopes = np.zeros(m), np.zeros((m, b, b + 1)), np.ones(m)
     for block, at in _by_block(matches, R, d):
@@ -142,13 +144,13 @@ def normal_equations(
         costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
         products[block.segments] = block.totals(columns[:, :b] @ np.swapaxes(columns, 1, 2))
     hessians = products[:, :, :b]
-    # Both triangles were summed; their last digits differ.
+    # Both triangles were summed separately and differ in the last digits.
     hessians = 0.5 * (hessians + np.swapaxes(hessians, 1, 2))
     return NormalEquations(costs * squared_scales, products[:, :, b], hessians, slopes)
 
 
 def _mean_slopes(pieces: Pieces, block: Block, weights: Array) -> Array:
-    """Sum of ``psi' = w (2 w - 1)`` over that of Cauchy's weights w (pieces, length) of each segment: (m,)."""
+    """Sum of ``psi' = w (2 w - 1)`` over that of the Cauchy weights w (pieces, length), for each segment: (m,)."""
     padding = weights.shape[1] - pieces.counts[block.pieces]  # of weight one
     sums = np.stack([weights.sum(axis=1), np.square(weights).sum(axis=1)], axis=1) - padding[:, None]
     first, second = block.totals(sums).T
@@ -164,14 +166,15 @@ def residuals(matches: Matches, R: Array, d: Array) -> Array:
 def derivatives_by_block(
     matches: Matches, R: Array, d: Array, *, with_focals: bool = False
 ) -> Iterator[tuple[slice, slice, IntArray, "SampsonDerivatives"]]:
-    """Runs of whole edges: their slice, their rows' slice, offsets from the first row, and derivatives."""
+    """Iterate over runs of whole edges: their slice, the slice of their rows, relative offsets, and derivatives."""
     pieces = matches.pieces
     for block, at in _by_block(matches, R, d):
         rays = []
         columns = pieces.columns[block.pieces]
         x1, x2 = columns[:, :3], columns[:, 3:]
-        if matches.shrinks is not None:
-            x1, x2 = (shrunk(x, factor[at.edge]) for x, factor in zip((x1, x2), matches.shrinks, strict=True))
+        if matches.focal_ratios is not None:
+            ratios1, ratios2 = matches.focal_ratios[:, at.edge]
+            x1, x2 = rescaled_rays(x1, ratios1), rescaled_rays(x2, ratios2)
         for Q, x, first, second, v in (
             (at.Q1, x1, -at.z[1], at.z[0], at.v1),
             (at.Q2, x2, at.y[1], -at.y[0], at.v2),
@@ -190,10 +193,10 @@ def derivatives_by_block(
 
 @dataclass(frozen=True, eq=False)
 class _AtFrames:
-    """Coordinates of a block's matches in their edges' frames, and what is made of them.
+    """Coordinates of a block's matches in the frames of their edges, with constraints, variances and residuals.
 
-    Of each match (pieces, length), vectors (3, pieces, length); of each piece its edge (pieces,), frames (pieces, 3, 3)
-    and variances (pieces, 1). Depths are the rays' third coordinates in their cameras.
+    Scalars per match are (pieces, length), vectors (3, pieces, length); per piece there are the edge (pieces,), frames
+    (pieces, 3, 3) and variances (pieces, 1). Depths are the third coordinates of the rays in their cameras.
     """
 
     edge: IntArray
@@ -220,26 +223,26 @@ def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -
     edge = matches.pieces.segments[block.pieces]
     Q1, Q2 = frames1[edge], frames2[edge]
     columns = matches.pieces.columns[block.pieces]
-    shrinks = (None, None) if matches.shrinks is None else matches.shrinks[:, edge]
-    y, depth1 = _turned(Q1, columns[:, :3], shrinks[0])
-    z, depth2 = _turned(Q2, columns[:, 3:], shrinks[1])
+    focal_ratios = (None, None) if matches.focal_ratios is None else matches.focal_ratios[:, edge]
+    y, depth1 = _rotated(Q1, columns[:, :3], focal_ratios[0])
+    z, depth2 = _rotated(Q2, columns[:, 3:], focal_ratios[1])
     v1, v2 = matches.variances[:, edge, None]
     c = z[0] * y[1] - z[1] * y[0]
     squared = c * c
-    # 1 - y_3^2 without cancellation near the epipole; the floor keeps a match on both epipoles finite.
+    # 1 - y_3^2 without cancellation near the epipole; the floor keeps a match at both epipoles finite.
     variance = (y[0] * y[0] + y[1] * y[1] - squared) * v2 + (z[0] * z[0] + z[1] * z[1] - squared) * v1
     np.maximum(variance, 1e-12 * (v1 + v2), out=variance)
     return _AtFrames(edge, Q1, Q2, depth1, depth2, y, z, v1, v2, c, variance, c / np.sqrt(variance))
 
 
-def _turned(Q: Array, x: Array, shrink: Array | None) -> tuple[Array, Array]:
-    """Coordinates ``Q^T x`` (3, pieces, length) of unit rays (pieces, 3, length), shrunk where asked, and depths."""
+def _rotated(Q: Array, x: Array, focal_ratio: Array | None) -> tuple[Array, Array]:
+    """Coordinates ``Q^T x`` (3, pieces, length) and depths of unit rays (pieces, 3, length) after rescaling."""
     depth = x[:, 2]
-    if shrink is None:
+    if focal_ratio is None:
         return np.moveaxis(np.swapaxes(Q, 1, 2) @ x, 1, 0), depth
-    # Shrinking goes with the frame, and the length is that of a ray that was of length one.
-    factors = np.stack([shrink, shrink, np.ones_like(shrink)], axis=1)
-    squared = np.square(shrink)[:, None]
+    # The frame is scaled instead of the rays; the length follows from that of a unit ray.
+    factors = np.stack([focal_ratio, focal_ratio, np.ones_like(focal_ratio)], axis=1)
+    squared = np.square(focal_ratio)[:, None]
     inverse = 1.0 / np.sqrt(squared + (1.0 - squared) * (depth * depth))
     turned = np.swapaxes(Q * factors[:, :, None], 1, 2) @ x
     turned *= inverse[:, None]
@@ -247,10 +250,10 @@ def _turned(Q: Array, x: Array, shrink: Array | None) -> tuple[Array, Array]:
 
 
 def _jacobian_and_residuals(at: _AtFrames, with_focals: bool, weights: Array | float = 1.0) -> Array:
-    """Derivatives of the residuals, 5 or with the focal lengths 7, and the residuals: (pieces, 6 or 8, length).
+    """Derivatives of the residuals (5, or 7 with focal lengths), then the residuals: (pieces, 6 or 8, length).
 
-    With ``c'`` the slope of the constraint and ``h + c c' (-v_1 - v_2)`` half that of s^2:
-    ``r' = c' (1 / s + r c (v_1 + v_2) / s^2) - h r / s^2``. All of it is multiplied by the weights (pieces, length).
+    With the derivative ``c'`` of the constraint and ``h + c c' (-v_1 - v_2)``, half that of s^2,
+    ``r' = c' (1 / s + r c (v_1 + v_2) / s^2) - h r / s^2``. All are multiplied by the weights (pieces, length).
     """
     y, z, c = at.y, at.z, at.c
     bend = at.r / at.variance

@@ -12,7 +12,7 @@ IntArray = NDArray[np.int64]
 
 
 def segment_of_rows(offsets: IntArray) -> IntArray:
-    """Segment of each row: (m + 1,) offsets to (k,)."""
+    """Index of the segment of each row: offsets (m + 1,) to (k,)."""
     return np.repeat(np.arange(len(offsets) - 1, dtype=np.int64), np.diff(offsets))
 
 
@@ -24,7 +24,7 @@ def segment_sums(offsets: IntArray, values: Array, weights: Array | None = None)
     offsets : (m + 1,) int array
     values : (k, ...) array
     weights : (k,) array, optional
-        One where missing.
+        Default: all one.
 
     Returns
     -------
@@ -32,7 +32,7 @@ def segment_sums(offsets: IntArray, values: Array, weights: Array | None = None)
     """
     k = len(values)
     data = np.ones(k) if weights is None else weights
-    # A product with a sparse indicator matrix: one pass in C, whatever the row length, and empty segments are right.
+    # A product with a sparse indicator matrix: one pass in C for any row length, and zero for empty segments.
     select = sp.csr_array((data, np.arange(k), offsets), shape=(len(offsets) - 1, k))
     width = int(np.prod(values.shape[1:], dtype=np.int64))
     return np.asarray(select @ values.reshape(k, width)).reshape(len(offsets) - 1, *values.shape[1:])
@@ -42,8 +42,8 @@ def segment_quantiles(offsets: IntArray, values: Array, quantile: float = 0.5) -
     """Quantiles of (k,) values within each segment, interpolated as ``np.quantile`` does; NaN where empty: (m,)."""
     count = np.diff(offsets)
     quantiles = np.full(len(count), np.nan)
-    # Segments of up to twice each other's size are sorted as rows of one array, many times faster than one long sort by
-    # two keys. NaN, the padding, sorts last.
+    # Segments whose sizes differ by less than a factor of two are sorted as rows of one array, many times faster than
+    # one long sort by two keys. The padding, NaN, sorts last.
     size = np.where(count > 0, np.frexp(count.astype(np.float64))[1], 0)
     for kind in np.unique(size[size > 0]):
         chosen = np.flatnonzero(size == kind)
@@ -60,24 +60,24 @@ def segment_quantiles(offsets: IntArray, values: Array, quantile: float = 0.5) -
 
 
 def segment_subset(offsets: IntArray, keep: NDArray[np.bool_]) -> IntArray:
-    """Offsets (m + 1,) of the rows that are kept, for a mask (k,) over the rows."""
+    """Offsets (m + 1,) of the segments after only the rows of a mask (k,) are kept."""
     return np.concatenate([[0], np.cumsum(keep)])[offsets].astype(np.int64)
 
 
 def rows_of_segments(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, IntArray]:
-    """Rows of some segments in order, and their new offsets: (m + 1,), (s,) to (k',), (s + 1,)."""
+    """Rows of the chosen segments (s,) and the offsets of these segments in them: (k',), (s + 1,)."""
     count = np.diff(offsets)[chosen]
     subset = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
     return np.arange(subset[-1]) + np.repeat(offsets[:-1][chosen] - subset[:-1], count), subset
 
 
 def evenly_thinned(offsets: IntArray, limit: int) -> NDArray[np.bool_]:
-    """Rows that thin each segment to at most `limit` of them, evenly over its order: (k,); all where limit is 0."""
+    """Mask (k,) that keeps at most `limit` rows of each segment at regular intervals; all rows where limit is 0."""
     counts = np.diff(offsets)
     if limit == 0 or (counts <= limit).all():
         return np.ones(int(offsets[-1]), dtype=bool)
     segment = segment_of_rows(offsets)
     rank = np.arange(len(segment)) - offsets[:-1][segment]
     kept = np.minimum(counts, limit)[segment]
-    # Row r of c stays where floor(r kept / c) rises: just `kept` rows.
+    # Keep row r of c where floor(r kept / c) increases: exactly `kept` rows.
     return np.asarray((rank * kept) // counts[segment] != ((rank - 1) * kept) // counts[segment])

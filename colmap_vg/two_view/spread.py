@@ -1,4 +1,4 @@
-"""Few matches of each pair that cover the image as all of them do not: one of each cell before two of any."""
+"""Subsampling of the matches of each pair, evenly over the image."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,26 +9,28 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 CELLS = 12
-"""Cells along each side of the part of image 1 that the matches of a pair cover."""
+"""Number of grid cells along each side of the bounding box of a pair's matches."""
 
 
 def well_spread(offsets: IntArray, bearings: Array, limit: int) -> NDArray[np.bool_]:
-    """Rows that thin each segment to at most `limit` of them, well spread over the image.
+    """Subsample each segment to at most `limit` rows that are spread evenly over the image.
 
-    Cells give up their matches in turn, in the order of the list, so that crowded cells give no more than empty ones
-    have to leave.
+    The bounding box of a segment's rays is divided into a grid. The first row of every cell is kept before the second
+    row of any, and so on.
 
     Parameters
     ----------
     offsets : (m + 1,) int64 array
+        Matches of pair k are rows ``offsets[k]:offsets[k + 1]``.
     bearings : (k, 3) array
-        Rays in one image of each pair.
+        Unit rays in one image of each pair.
     limit : int
-        0: all.
+        Maximum number of rows per segment; 0 keeps all.
 
     Returns
     -------
     (k,) bool array
+        True for rows that are kept.
     """
     kept = np.ones(int(offsets[-1]), dtype=np.bool_)
     crowded = np.flatnonzero(np.diff(offsets) > limit)
@@ -37,7 +39,7 @@ def well_spread(offsets: IntArray, bearings: Array, limit: int) -> NDArray[np.bo
     rows, starts = rows_of_segments(offsets, crowded)
     segment = segment_of_rows(starts)
     cell = segment
-    # Rays at a right angle to the axis have no place in a plane; those of wide lenses are scaled, not lost.
+    # Rays at a right angle to the optical axis have no image in a plane: this projection is finite for all of them.
     for place in (bearings[rows, :2] / (1.0 + np.abs(bearings[rows, 2:]))).T:
         low, high = np.minimum.reduceat(place, starts[:-1]), np.maximum.reduceat(place, starts[:-1])
         width = np.maximum(high - low, np.finfo(np.float64).tiny)
@@ -52,7 +54,7 @@ def well_spread(offsets: IntArray, bearings: Array, limit: int) -> NDArray[np.bo
 
 
 def _rank_in_group(group: IntArray) -> IntArray:
-    """How many earlier ones of the same group there are."""
+    """Number of earlier elements of the same group, for each element."""
     order = np.argsort(group, kind="stable")
     ordered = group[order]
     first = np.concatenate([[True], ordered[1:] != ordered[:-1]])

@@ -205,7 +205,7 @@ def test_nothing_to_adjust_is_an_error():
     empty = problem.without(np.ones(len(problem.edges), bool))
     with pytest.raises(GraphError, match="no matches"):
         adjust_epipolar(empty, R, p, np.zeros((0, 3)))
-    with pytest.raises(GraphError, match="one place"):
+    with pytest.raises(GraphError, match="coincide"):
         adjust_epipolar(problem, R, np.zeros_like(p), directions_of(problem, R, p))
 
 

@@ -6,9 +6,9 @@ from image_sets import image_set
 
 from colmap_vg.epipolar import baseline_lengths
 from colmap_vg.epipolar.baseline_lengths import (
-    LengthLinks,
+    BaselineRatios,
     connects_all,
-    length_links,
+    estimate_baseline_ratios,
     positions_by_lengths,
     solve_lengths,
 )
@@ -30,7 +30,7 @@ def true_lengths(edges, p):
 def test_exact_tracks_give_exact_lengths_and_positions(layout):
     problem, R, p = image_set(3, layout, 16, 1500, 0.0)
     relative, directions = relative_poses(problem.edges, R, p)
-    lengths = solve_lengths(len(problem.edges), length_links(problem, relative, directions))
+    lengths = solve_lengths(len(problem.edges), estimate_baseline_ratios(problem, relative, directions))
     factors = lengths / true_lengths(problem.edges, p)
     assert np.isfinite(factors).all()
     np.testing.assert_allclose(factors, factors[0], rtol=1e-7)
@@ -42,7 +42,7 @@ def test_exact_tracks_give_exact_lengths_and_positions(layout):
 def test_noise_of_a_pixel_moves_lengths_along_a_street_by_little():
     problem, R, p = image_set(4, "street", 40, 6000, 1.0)
     relative, directions = relative_poses(problem.edges, R, p)
-    lengths = solve_lengths(len(problem.edges), length_links(problem, relative, directions))
+    lengths = solve_lengths(len(problem.edges), estimate_baseline_ratios(problem, relative, directions))
     errors = np.log(lengths / true_lengths(problem.edges, p))
     assert np.abs(errors - np.median(errors)).max() < 0.05
 
@@ -55,7 +55,7 @@ def test_false_directions_and_rotations_do_not_move_positions():
     assert false.sum() > 5
     relative[false] = so3.exp(rng.standard_normal((false.sum(), 3))) @ relative[false]
     directions[false] = normalized(rng.standard_normal((false.sum(), 3)))
-    lengths = solve_lengths(len(problem.edges), length_links(problem, relative, directions))
+    lengths = solve_lengths(len(problem.edges), estimate_baseline_ratios(problem, relative, directions))
     world = np.einsum("kba,kb->ka", R[problem.edges[:, 0]], directions)
     found = positions_by_lengths(25, problem.edges, world, lengths)
     radius = np.linalg.norm(p, axis=1).max()
@@ -70,13 +70,13 @@ def test_false_ratios_do_not_move_lengths():
     ratios = true[links[:, 0]] - true[links[:, 1]]
     false = rng.random(len(links)) < 0.2
     ratios[false] += rng.normal(0, 2, false.sum())
-    lengths = solve_lengths(60, LengthLinks(links, ratios, np.full(len(links), 1e-3)))
+    lengths = solve_lengths(60, BaselineRatios(links, ratios, np.full(len(links), 1e-3)))
     errors = np.log(lengths) - true
     assert np.abs(errors - np.median(errors)).max() < 0.02
 
 
 def test_only_the_largest_group_of_edges_gets_lengths():
-    links = LengthLinks(np.array([[0, 1], [3, 4], [4, 5]]), np.log([2.0, 3.0, 0.5]), np.full(3, 0.01))
+    links = BaselineRatios(np.array([[0, 1], [3, 4], [4, 5]]), np.log([2.0, 3.0, 0.5]), np.full(3, 0.01))
     lengths = solve_lengths(7, links)
     assert np.isnan(lengths[[0, 1, 2, 6]]).all()
     np.testing.assert_allclose(lengths[3] / lengths[4], 3.0)
@@ -100,14 +100,14 @@ def test_edges_of_unknown_length_take_theirs_from_the_start():
 def test_links_need_tracks_in_front(monkeypatch):
     problem, R, p = image_set(6, "ring", 8, 300, 0.0)
     relative, directions = relative_poses(problem.edges, R, p)
-    whole = length_links(problem, relative, directions)
+    whole = estimate_baseline_ratios(problem, relative, directions)
     assert len(whole.edges) > 0
-    behind = length_links(problem, relative, -directions)
+    behind = estimate_baseline_ratios(problem, relative, -directions)
     assert len(behind.edges) == 0
     monkeypatch.setattr(baseline_lengths, "MIN_TRACKS", 10**6)
-    assert len(length_links(problem, relative, directions).edges) == 0
+    assert len(estimate_baseline_ratios(problem, relative, directions).edges) == 0
 
 
 def test_ratios_that_noise_swamps_are_not_firm() -> None:
-    links = LengthLinks(np.array([[0, 1], [1, 2], [2, 3]]), np.zeros(3), np.array([0.001, 0.09, 0.2]))
-    assert links.firm.tolist() == [True, True, False]
+    links = BaselineRatios(np.array([[0, 1], [1, 2], [2, 3]]), np.zeros(3), np.array([0.001, 0.09, 0.2]))
+    assert links.reliable.tolist() == [True, True, False]

@@ -38,10 +38,10 @@ def bent(problem: EpipolarProblem, term: float) -> EpipolarProblem:
 @pytest.mark.parametrize("term", [-0.2, 0.15])
 def test_a_term_is_taken_out_exactly(term: float) -> None:
     problem, _, _ = image_set(0, "ring", 8, 300, 0.5)
-    straight = bent(problem, term).straightened(term, ALL)
+    straight = bent(problem, term).undistorted(term, ALL)
     np.testing.assert_allclose(straight.bearings1, problem.bearings1, atol=1e-9)
     np.testing.assert_allclose(straight.triplets.bearings, problem.triplets.bearings, atol=1e-9)
-    same = problem.straightened(term, ~ALL)
+    same = problem.undistorted(term, ~ALL)
     np.testing.assert_allclose(same.bearings2, problem.bearings2, atol=1e-15)
 
 
@@ -49,7 +49,7 @@ def test_rays_off_the_axis_and_beyond_a_maximum_stay_finite() -> None:
     problem, _, _ = image_set(0, "ring", 4, 100, 0.5)
     wide = problem.bearings1.copy()
     wide[:3] = normalized(np.array([[1.0, 0.0, -0.2], [2.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
-    straight = replace(problem, bearings1=wide).straightened(-0.5, ALL).bearings1
+    straight = replace(problem, bearings1=wide).undistorted(-0.5, ALL).bearings1
     assert np.isfinite(straight).all()
     np.testing.assert_allclose(straight[[0, 2]], wide[[0, 2]])
 

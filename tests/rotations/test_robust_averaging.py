@@ -124,7 +124,7 @@ def test_same_bits_twice_and_disconnected_refused():
     g = ring_scene(40, rotation_sigma=0.05, outlier_share=0.1, seed=0).graph
     first, second = (average_rotations_robust(40, g.edges, g.cam2_from_cam1_rotations) for _ in range(2))
     assert np.array_equal(first.cam_from_world_rotations, second.cam_from_world_rotations)
-    with pytest.raises(GraphError, match="image rows 40 are not linked"):
+    with pytest.raises(GraphError, match="image rows 40 are not connected"):
         average_rotations_robust(41, g.edges, g.cam2_from_cam1_rotations)
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.two_view import pieces as module
-from colmap_vg.two_view.pieces import Pieces, shrunk
+from colmap_vg.two_view.pieces import Pieces, rescaled_rays
 
 COUNTS = st.lists(st.one_of(st.integers(0, 3), st.integers(0, 700)), min_size=1, max_size=12)
 
@@ -59,7 +59,7 @@ def test_longer_focal_lengths_draw_rays_to_the_axis_and_leave_padding_alone():
     rays = normalized(rng.standard_normal((4, 5, 3)))
     rays[2, 3:] = 0.0
     factors = np.array([1.0, 0.5, 2.0, 0.9])
-    found = shrunk(np.swapaxes(rays, 1, 2), factors)
+    found = rescaled_rays(np.swapaxes(rays, 1, 2), factors)
     expected = rays * np.stack([factors, factors, np.ones(4)], axis=1)[:, None]
     length = np.linalg.norm(expected, axis=2, keepdims=True)
     expected = np.divide(expected, length, out=np.zeros_like(expected), where=length > 0)
