@@ -1,4 +1,4 @@
-"""From a COLMAP database to a viewing graph: every image, every verified pair, each with a verdict."""
+"""Read a viewing graph from a COLMAP database: all images, and all verified pairs with a verdict each."""
 
 from os import PathLike
 
@@ -26,12 +26,13 @@ BoolArray = NDArray[np.bool_]
 
 
 def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | None = None) -> ViewGraph:
-    """Viewing graph of a COLMAP database, which is never modified.
+    """Read the viewing graph of a COLMAP database.
 
     Parameters
     ----------
     database_path : path
-        A database with keypoints and verified matches, by COLMAP of any version or by another matcher.
+        A database with keypoints and verified matches, by COLMAP of any version or by another matcher. It is never
+        modified.
     options : ReadOptions, optional
 
     Returns
@@ -52,7 +53,7 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
 
 @single_threaded_blas
 def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) -> tuple[ViewGraph, tuple[str, ...]]:
-    """The viewing graph, and what was changed or could not be decided on reading, one sentence each."""
+    """Read the viewing graph, and sentences on what was changed or could not be decided on reading."""
     tables = read_tables(database_path)
     terms = np.zeros(len(tables.cameras))
     if options.find_distortion:
@@ -76,7 +77,7 @@ def _graph(
     num_inliers = np.diff(offsets)
     excluded = listed_edges(options.excluded_pairs_path, tables.image_names, tables.pairs)
     trusted = listed_edges(options.trusted_pairs_path, tables.image_names, tables.pairs) & ~excluded
-    # A trusted pair needs no confirmation of its fundamental matrix.
+    # A trusted pair is used even if nothing confirms its fundamental matrix.
     doubted = trusted & (geometry.verdicts == EdgeVerdict.UNCALIBRATED)
     verdicts = np.where(excluded, str(EdgeVerdict.EXCLUDED), geometry.verdicts)
     verdicts = np.where(doubted, str(EdgeVerdict.KEPT), verdicts)

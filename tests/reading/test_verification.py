@@ -97,7 +97,7 @@ def test_unverified_matches_are_verified(
     assert 0.9 * wrong <= removed <= 1.1 * wrong
     error, warnings = mean_error(path, noisy[1], tmp_path)
     assert error < 0.003
-    assert any("matches look unverified" in warning for warning in warnings)
+    assert any("matches were not verified" in warning for warning in warnings)
 
 
 def test_what_explains_its_matches_is_left_alone(noisy: tuple[Path, pycolmap.Reconstruction]) -> None:
