@@ -47,7 +47,7 @@ def compared_pairs(database_path: str | PathLike[str]) -> IntArray:
     """Image ids (k, 2) of the pairs that were compared, matched or not: COLMAP stores pairs without matches, too."""
     with reading(database_path) as connection:
         tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-        asked = [f"SELECT pair_id FROM {name}" for name in ("matches", "two_view_geometries") if name in tables]
-        found = connection.execute(" UNION ".join(asked)).fetchall()
+        queries = [f"SELECT pair_id FROM {name}" for name in ("matches", "two_view_geometries") if name in tables]
+        found = connection.execute(" UNION ".join(queries)).fetchall()
     pair_ids = np.array(found, dtype=np.int64).reshape(-1)
     return np.stack([pair_ids // MAX_NUM_IMAGES, pair_ids % MAX_NUM_IMAGES], axis=1)

@@ -63,7 +63,7 @@ def merge_cameras(database_path: Path, groups: Sequence[Sequence[int]]) -> dict[
     return replaced
 
 
-def with_own_cameras(
+def with_database_cameras(
     cache: "pycolmap.DatabaseCache", model: "pycolmap.Reconstruction", replaced: dict[int, int]
 ) -> "pycolmap.Reconstruction":
     """Copy a model, with the database's own cameras in place of shared ones.

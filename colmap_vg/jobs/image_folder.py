@@ -126,7 +126,7 @@ def make_database(
         if resume and record_path.exists() and not same:
             log.warn(f"{work} was made from other photographs or with other options: features are extracted again")
         if not same:
-            _start_afresh(finished, unfinished, record_path, record)
+            _remove_previous(finished, unfinished, record_path, record)
         with readable_folder(image_path, photographs, options, work / COPIES_NAME) as (folder, reading):
             names, unreadable = extract_features_apart(folder, unfinished, names, reading, log, lock_descriptors())
         num_verified_pairs = match_features_apart(unfinished, options, log, lock_descriptors())
@@ -137,7 +137,7 @@ def make_database(
         return FeatureResult(tuple(names), (*skipped, *unreadable), num_verified_pairs)
 
 
-def _start_afresh(finished: Path, unfinished: Path, record_path: Path, record: dict[str, object]) -> None:
+def _remove_previous(finished: Path, unfinished: Path, record_path: Path, record: dict[str, object]) -> None:
     """Remove the database of an earlier job and write a new record.
 
     The old record is removed first, so that a job killed in between leaves nothing that seems complete.

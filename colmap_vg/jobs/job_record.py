@@ -39,7 +39,7 @@ class JobState:
 def recorded_job(
     output_path: Path,
     verb: str,
-    asked: Mapping[str, object],
+    inputs: Mapping[str, object],
     source: Path | None,
     *,
     overwrite: bool,
@@ -51,7 +51,7 @@ def recorded_job(
     ----------
     output_path : Path
     verb : str
-    asked : mapping of str to object
+    inputs : mapping of str to object
         The job's inputs and options.
     source : Path or None
         Database or image folder; jobs on different files are different jobs.
@@ -69,7 +69,7 @@ def recorded_job(
     with output_lock(output_path):
         path = output_path / WORK_NAME / RECORD_NAME
         job = json.loads(
-            json.dumps({"verb": verb, "options": _inputs(plain(asked)), "source": _fingerprint(source, output_path)})
+            json.dumps({"verb": verb, "options": _inputs(plain(inputs)), "source": _fingerprint(source, output_path)})
         )
         before = _read(path) if resume else {}
         models = existing_models(output_path)
@@ -88,11 +88,11 @@ def recorded_job(
         atomic_write(path, json.dumps({**job, "finished": True}, indent=1))
 
 
-def _inputs(asked: object) -> object:
+def _inputs(inputs: object) -> object:
     """Options without those that the result does not depend on."""
-    if isinstance(asked, Mapping):
-        return {name: _inputs(value) for name, value in asked.items() if name not in ("overwrite", "resume")}
-    return asked
+    if isinstance(inputs, Mapping):
+        return {name: _inputs(value) for name, value in inputs.items() if name not in ("overwrite", "resume")}
+    return inputs
 
 
 def _fingerprint(source: Path | None, output_path: Path) -> str:

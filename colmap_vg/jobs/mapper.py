@@ -14,7 +14,7 @@ from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.quiet import quiet_colmap
 from colmap_vg.colmap_io.raw_matches import compared_pairs
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
-from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
+from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cameras
 from colmap_vg.errors import MappingError
 from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.geometry.similarity import align_positions
@@ -41,7 +41,7 @@ from colmap_vg.solver.agreement import pair_agreement
 from colmap_vg.solver.solve import solve_view_graph
 from colmap_vg.solver.state import described
 
-SAME_LENS_COST = 0.8
+SHARED_LENS_COST_RATIO = 0.8
 """Ratio of final to initial cost of bundle adjustment with one calibration per camera, below which shared calibrations
 are given up. With a single lens it was 0.98 to 0.99 for images with many observations, 0.89 for those with few."""
 ROUGH_MATCHES = 100
@@ -216,7 +216,7 @@ def _build(
             loaded_cache(database_path, work, options.read.min_num_inliers, (), without, graph) as (cache, _),
         ):
             models = [
-                replace(m, reconstruction=_on_own_cameras(cache, m.reconstruction, replaced, options, log))
+                replace(m, reconstruction=_with_database_cameras(cache, m.reconstruction, replaced, options, log))
                 for m in models
             ]
     return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
@@ -385,7 +385,7 @@ def _solve_options(options: MappingOptions) -> SolveOptions:
     return solve if options.ba_refine_focal_length else replace(solve, refine_focal_lengths="never")
 
 
-def _on_own_cameras(
+def _with_database_cameras(
     cache: "pycolmap.DatabaseCache",
     shared: "pycolmap.Reconstruction",
     replaced: dict[int, int],
@@ -393,16 +393,16 @@ def _on_own_cameras(
     log: StageLog,
 ) -> "pycolmap.Reconstruction":
     """Give a model the database's own cameras; with the shared calibrations unless separate ones fit clearly better."""
-    trial = with_own_cameras(cache, shared, replaced)
-    left = adjust_once_more(cache, trial, options)
-    if left < SAME_LENS_COST:
+    trial = with_database_cameras(cache, shared, replaced)
+    cost_ratio = adjust_once_more(cache, trial, options)
+    if cost_ratio < SHARED_LENS_COST_RATIO:
         for _ in range(MAX_NUM_ROUNDS):
             if adjust_once_more(cache, trial, options) > CONVERGED_COST_RATIO:
                 break
-        log.result(f"different lenses: with separate calibrations the cost falls by {1.0 - left:.0%}")
+        log.result(f"different lenses: with separate calibrations the cost falls by {1.0 - cost_ratio:.0%}")
         return trial
-    log.result(f"one lens: with separate calibrations the cost would fall by only {1.0 - left:.1%}")
-    model = with_own_cameras(cache, shared, replaced)
+    log.result(f"one lens: with separate calibrations the cost would fall by only {1.0 - cost_ratio:.1%}")
+    model = with_database_cameras(cache, shared, replaced)
     model.tear_down()  # removes the cameras, rigs and images of other models
     return model
 

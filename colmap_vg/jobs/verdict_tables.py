@@ -92,8 +92,8 @@ def verdict_tables(graph: ViewGraph, solution: PoseSolution, skipped: Mapping[st
     kept = np.bincount(graph.edges[solution.edge_kept].ravel(), minlength=graph.num_images)
     position, turn = deviations(solution)
     images = [
-        ImageRow(name, str(model) if model >= 0 else "", str(verdict), int(own), int(held), _number(p), _number(t))
-        for name, model, verdict, own, held, p, t in zip(
+        ImageRow(name, str(model) if model >= 0 else "", str(verdict), int(own), int(num_kept), _number(p), _number(t))
+        for name, model, verdict, own, num_kept, p, t in zip(
             names, solution.component.tolist(), solution.image_verdicts, count, kept, position, turn, strict=True
         )
     ]

@@ -97,15 +97,18 @@ def build_model(
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):
         lenses = _focal_lengths(reconstruction)
-        left, enough = _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4), GOOD_START_COST_RATIO
+        cost_ratio, enough = (
+            _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4),
+            GOOD_START_COST_RATIO,
+        )
         for _ in range(MAX_NUM_ROUNDS):
             before, lenses = lenses, _focal_lengths(reconstruction)
             mapper.complete_and_merge_tracks(triangulator)
             mapper.retriangulate(triangulator)
             _filter(mapper)
-            if left >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
+            if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
                 break
-            left, enough = (
+            cost_ratio, enough = (
                 _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5),
                 CONVERGED_COST_RATIO,
             )
@@ -130,7 +133,7 @@ def build_model(
             cache,
             options,
             log,
-            lambda held: _adjust(mapper, held, max_num_iterations=20, function_tolerance=1e-5),
+            lambda changed: _adjust(mapper, changed, max_num_iterations=20, function_tolerance=1e-5),
         )
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
@@ -166,11 +169,11 @@ def _adjust(
     mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, max_num_iterations: int, function_tolerance: float
 ) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
-    left = adjust_bundle(
+    cost_ratio = adjust_bundle(
         mapper.reconstruction, options, max_num_iterations=max_num_iterations, function_tolerance=function_tolerance
     )
     _filter(mapper)
-    return left
+    return cost_ratio
 
 
 def _filter(mapper: "pycolmap.IncrementalMapper") -> None:

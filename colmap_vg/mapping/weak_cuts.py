@@ -96,7 +96,7 @@ def weak_cuts(
     """
     image_ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
     links = agreeing_pairs(reconstruction, image_ids, pairs)
-    return _judged(reconstruction, image_ids, links, compared, _weak_sides(len(image_ids), *links))
+    return _evaluated_cuts(reconstruction, image_ids, links, compared, _weak_sides(len(image_ids), *links))
 
 
 def cut_along(
@@ -106,11 +106,11 @@ def cut_along(
     image_ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
     links = agreeing_pairs(reconstruction, image_ids, pairs)
     side = np.isin(image_ids, sorted(images))
-    (cut,) = _judged(reconstruction, image_ids, links, compared, [(np.ones(len(image_ids), dtype=bool), side)])
+    (cut,) = _evaluated_cuts(reconstruction, image_ids, links, compared, [(np.ones(len(image_ids), dtype=bool), side)])
     return cut
 
 
-def _judged(
+def _evaluated_cuts(
     reconstruction: "pycolmap.Reconstruction",
     image_ids: IntArray,
     links: tuple[IntArray, Array],

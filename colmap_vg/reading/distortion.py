@@ -60,7 +60,7 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
             kinds.setdefault((camera.model_name, camera.width, camera.height), []).append(row)
     caveats = []
     for rows in kinds.values():
-        kappa, gain = _found_term(tables, database_path, np.isin(tables.camera_idx, rows))
+        kappa, gain = _estimated_term(tables, database_path, np.isin(tables.camera_idx, rows))
         if kappa == 0.0:
             continue
         for row in rows:
@@ -80,7 +80,9 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
     return with_raw_matches(distorted, database_path, of_distorted), terms
 
 
-def _found_term(tables: DatabaseTables, database_path: str | PathLike[str], images: BoolArray) -> tuple[float, float]:
+def _estimated_term(
+    tables: DatabaseTables, database_path: str | PathLike[str], images: BoolArray
+) -> tuple[float, float]:
     """Kappa that maximises the agreeing matches between marked images, and its gain; 0 where the gain is too small."""
     pairs, matches = _sampled_matches(tables, database_path, images)
     if not pairs:

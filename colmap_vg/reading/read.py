@@ -15,7 +15,7 @@ from colmap_vg.reading.distortion import with_found_distortion
 from colmap_vg.reading.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.reading.relative_poses import relative_poses
 from colmap_vg.reading.still_background import without_still_background
-from colmap_vg.reading.verification import with_own_geometries
+from colmap_vg.reading.verification import with_verified_geometries
 from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.two_view.segments import evenly_thinned, segment_subset
@@ -60,7 +60,7 @@ def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) 
         tables, terms = with_found_distortion(tables, database_path)
     tables, thinned = without_still_background(tables, database_path)
     expected = thinned | (terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1)
-    tables, changed = with_own_geometries(tables, options.random_seed, expected)
+    tables, changed = with_verified_geometries(tables, options.random_seed, expected)
     changed |= thinned
     focals = decide_focal_lengths(tables, options)
     return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)

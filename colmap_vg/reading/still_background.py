@@ -39,11 +39,11 @@ def without_still_background(
     changed : (m,) bool array
         Whether each pair's matches changed.
     """
-    asked = np.diff(tables.offsets) >= MIN_NUM_MATCHES
+    enough = np.diff(tables.offsets) >= MIN_NUM_MATCHES
     few = evenly_thinned(tables.offsets, MAX_MATCHES_CHECKED)
     thinned = replace(tables, matches=tables.matches[few], offsets=segment_subset(tables.offsets, few))
-    still = asked & (segment_quantiles(thinned.offsets, _motions(thinned)) <= MAX_STILL_PX)
-    if still.sum() <= MIN_SHARE_STILL * asked.sum():
+    still = enough & (segment_quantiles(thinned.offsets, _motions(thinned)) <= MAX_STILL_PX)
+    if still.sum() <= MIN_SHARE_STILL * enough.sum():
         return tables, np.zeros(len(still), dtype=bool)
     raw = with_raw_matches(tables, database_path, still)
     moving = _motions(raw) > MAX_STILL_PX
@@ -52,7 +52,7 @@ def without_still_background(
         # Nothing moves: camera and scene are both static.
         return tables, np.zeros(len(still), dtype=bool)
     caveat = (
-        f"In {int(still.sum())} of {int(asked.sum())} pairs the background does not move with the object: static"
+        f"In {int(still.sum())} of {int(enough.sum())} pairs the background does not move with the object: static"
         f" matches ({1.0 - moving.mean():.0%} of all) are removed. Masking the background is more reliable."
     )
     found = replace(

@@ -42,7 +42,7 @@ FAR = 1e12
 """Distance, pixels, in place of an undefined one: the matrix is missing or degenerate for the match."""
 
 
-def with_own_geometries(
+def with_verified_geometries(
     tables: DatabaseTables, seed: int, expected: BoolArray | None = None
 ) -> tuple[DatabaseTables, BoolArray]:
     """Replace the two-view geometries that do not explain their matches.
