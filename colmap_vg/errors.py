@@ -1,8 +1,8 @@
-"""Every error that a user or the data can cause. Each message says what was found, where, and what to do."""
+"""Errors that users or their data can cause. Each message says what was found, where, and what to do."""
 
 
 class ColmapVgError(Exception):
-    """Base of every error that a user can cause; the command line prints it as one line and exits with 1."""
+    """Base class of all errors that users can cause; the command line prints it on one line and exits with 1."""
 
 
 class OptionError(ColmapVgError, ValueError):
@@ -10,19 +10,19 @@ class OptionError(ColmapVgError, ValueError):
 
 
 class GraphError(ColmapVgError, ValueError):
-    """A viewing graph is malformed: wrong shapes, rows out of range, matrices that are no rotations."""
+    """A viewing graph is malformed: wrong shapes, rows out of range, or matrices that are not rotations."""
 
 
 class DatabaseError(ColmapVgError):
-    """A COLMAP database is missing, unreadable, damaged, or holds nothing to map."""
+    """A COLMAP database is missing, unreadable, damaged, or contains nothing to map."""
 
 
 class ImageFolderError(ColmapVgError):
-    """A folder of photographs is missing, empty, or holds none that can be read."""
+    """A folder of photographs is missing, empty, or contains none that can be read."""
 
 
 class DataFileError(ColmapVgError):
-    """A data file has a bad row; the message names file and line."""
+    """A data file is missing or has a bad row; the message names file and line."""
 
 
 class OutputError(ColmapVgError):

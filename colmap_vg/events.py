@@ -1,4 +1,4 @@
-"""Stages of a job: their time, peak memory and progress, told to whoever listens."""
+"""Stages of a job: time, peak memory, progress and warnings, passed to a callback."""
 
 import resource
 import time
@@ -12,18 +12,18 @@ StageState = Literal["started", "progress", "finished", "warning"]
 
 @dataclass(frozen=True)
 class StageEvent:
-    """Something that happened in a job.
+    """Event of a job: a stage starts, progresses, ends or warns.
 
     Attributes
     ----------
     stage : str
     state : "started", "progress", "finished" or "warning"
     message : str
-        One line for people; may be empty.
+        One line for users; may be empty.
     fraction : float or None
-        Share of the stage that is done, when known.
+        Share of the stage that is done, 0 to 1; None if unknown.
     seconds : float
-        Time since the stage began.
+        Time since the stage started.
     """
 
     stage: str
@@ -45,7 +45,7 @@ class StageRecord:
     peak_memory_mib : float
         The process's peak resident memory when the stage ended.
     message : str
-        What the stage had to say of its result.
+        One line on the stage's result.
     """
 
     stage: str
@@ -56,12 +56,12 @@ class StageRecord:
 
 @dataclass
 class StageLog:
-    """Collects stage records and warnings, and passes events on.
+    """Log of a job that collects stage records and warnings, and passes events to a callback.
 
     Parameters
     ----------
     on_event : callable, optional
-        Called with each `StageEvent`, in the thread that does the work; an exception from it stops the job.
+        Called with each `StageEvent` in the thread that runs the job; an exception from it stops the job.
     """
 
     on_event: Callable[[StageEvent], None] | None = None
@@ -73,7 +73,7 @@ class StageLog:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time the body as stage `name`. Stages do not nest."""
+        """Run the body as stage `name` and record its time. Stages do not nest."""
         self._stage, self._start, self._message = name, time.perf_counter(), ""
         self._emit("started")
         yield
@@ -82,15 +82,15 @@ class StageLog:
         self._emit("finished", self._message)
 
     def progress(self, message: str = "", fraction: float | None = None) -> None:
-        """Tell how far the current stage is."""
+        """Emit an event on the progress of the current stage."""
         self._emit("progress", message, fraction)
 
     def result(self, message: str) -> None:
-        """Set the line that the stage's record will hold."""
+        """Set the line on the result of the current stage for its record."""
         self._message = message
 
     def warn(self, message: str) -> None:
-        """Keep a caveat for the summary and pass it on."""
+        """Store a warning for the summary and emit it as an event."""
         self.warnings.append(message)
         self._emit("warning", message)
 

@@ -1,7 +1,7 @@
-"""How far solved poses are from true ones, whatever the gauge.
+"""Errors of estimated poses with respect to true ones, after removing the gauge.
 
 Positions are compared after the best similarity over all cameras (eq. rts of Nasiri et al.), rotations after the best
-single rotation of the world, relative poses as they are: they have no gauge but the scale, and their translations are
+rotation of the world. Relative poses need no alignment: their only gauge is the scale, and their translations are
 compared by direction.
 """
 
@@ -20,20 +20,21 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 AUC_THRESHOLDS_DEG = (0.5, 1.0, 5.0, 10.0)
+"""Default thresholds of the area under the curve, degrees."""
 FAILED_DEG = 180.0
-"""Error of a pair of which an image is not registered, as in COLMAP's benchmark."""
+"""Error of a pair with an image that is not registered, degrees, as in COLMAP's benchmark."""
 PAIRS_AT_ONCE = 500_000
-"""Ordered pairs compared in one batch: about 200 MB."""
+"""Number of ordered pairs compared in one batch, which takes about 200 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class PositionErrors:
-    """Distances to the true positions after the best similarity, in the unit of the truth.
+    """Distances to the true positions after the best similarity, in the unit of the true positions.
 
     Attributes
     ----------
     rms, mean, median : float
-        Over cameras. (The paper divides the RMS by "the number of edges" m, with a sum that runs over cameras.)
+        Over cameras. (The paper divides by "the number of edges" m in the RMS, but sums over cameras.)
     distances : (n,) array
     similarity : Similarity
         ``truth ≈ similarity(estimated)``.
@@ -66,7 +67,7 @@ class RotationErrors:
 
 
 def position_errors(estimated: Array, truth: Array) -> PositionErrors:
-    """Errors of positions (eq. RMSE of Nasiri et al.).
+    """Compute errors of positions after the best similarity (eq. RMSE of Nasiri et al.).
 
     Parameters
     ----------
@@ -87,7 +88,7 @@ def position_errors(estimated: Array, truth: Array) -> PositionErrors:
 
 
 def rotation_errors(estimated: Array, truth: Array) -> RotationErrors:
-    """Errors of rotations after the world's rotation of least chordal distance.
+    """Compute errors of rotations after the rotation of the world with the least chordal distance.
 
     Parameters
     ----------
@@ -119,11 +120,11 @@ def relative_pose_errors(
     registered: BoolArray | None = None,
     min_baseline: float = 0.0,
 ) -> Array:
-    """Angular errors of the relative poses of all ordered pairs of images, degrees.
+    """Compute angular errors of the relative poses of all ordered pairs of images, degrees.
 
     An error is the larger of the angle between the relative rotations and the angle between the directions of the
-    relative translations, as in COLMAP's benchmark. Both orders of a pair count: the direction is seen from the
-    second camera, with its rotation's error.
+    relative translations, as in COLMAP's benchmark. Both orders of a pair count, since the direction is expressed in
+    the second camera's frame and contains the error of its rotation.
 
     Parameters
     ----------
@@ -132,13 +133,14 @@ def relative_pose_errors(
     estimated_centers, true_centers : (n, 3) array
         Any world frames and scales.
     registered : (n,) bool array, optional
-        Pairs with an image that is not registered count with 180 degrees; default all with finite positions.
+        Pairs with an image that is not registered have an error of 180 degrees. Default: images with finite positions.
     min_baseline : float
-        Below this true distance a direction tells nothing and only rotations are compared; unit of the truth.
+        True distance below which only rotations are compared, in the unit of the true positions.
 
     Returns
     -------
     (n (n - 1),) array
+        Errors of pairs (i, j), i != j, ordered by i and then j.
 
     Raises
     ------
@@ -161,7 +163,7 @@ def relative_pose_errors(
         true = np.einsum("kab,kb->ka", T[j], q[j] - q[i])
         baseline = np.linalg.norm(true, axis=1)
         direction = angle_between(estimated, true)
-        # Cameras that were put in one place have no direction: half way, as the benchmark's dot product has it.
+        # Cameras at the same position have no direction; the error is 90 degrees, as in the benchmark.
         direction = np.where(baseline * np.linalg.norm(estimated, axis=1) > 0.0, direction, 0.5 * np.pi)
         direction = np.where(baseline < min_baseline, 0.0, direction)
         worst = np.degrees(np.maximum(so3.angle(turned), direction))
@@ -170,15 +172,15 @@ def relative_pose_errors(
 
 
 def area_under_curve(errors: Array, thresholds: Sequence[float] = AUC_THRESHOLDS_DEG) -> Array:
-    """Area under the curve of recall over error up to each threshold, as a share of the threshold: 0 to 1.
+    """Compute the area under the recall curve up to each error threshold, as a share of the threshold, 0 to 1.
 
-    The recall rises linearly from one error to the next and is flat from the last one to the threshold, as in COLMAP's
-    benchmark (which gives percent).
+    The recall is linear between errors and constant from the last one to the threshold, as in COLMAP's benchmark
+    (which gives percent).
 
     Parameters
     ----------
     errors : (k,) array
-        k >= 1; infinite ones never count as recalled.
+        k >= 1; infinite errors are never recalled.
     thresholds : sequence of float
         Positive, in the unit of the errors.
 
@@ -214,12 +216,12 @@ def _checked(estimated: Array, truth: Array, shape: tuple[int, ...], where: str)
             f"{where} needs arrays (n, {', '.join(map(str, shape))}), n >= 1, found {estimated.shape}, {truth.shape}"
         )
     if not (np.isfinite(estimated).all() and np.isfinite(truth).all()):
-        raise GraphError(f"{where}: poses hold NaN or infinite values; leave unregistered images out first")
+        raise GraphError(f"{where}: poses contain NaN or infinite values; remove unregistered images first")
     return estimated, truth
 
 
 def _ordered_pairs(n: int) -> Iterator[tuple[slice, NDArray[np.int64], NDArray[np.int64]]]:
-    """All (i, j), i != j, by i and then j, in batches: where each goes, i (k,), j (k,)."""
+    """Yield all (i, j), i != j, ordered by i and then j, in batches: slice of the result, i (k,), j (k,)."""
     total = n * (n - 1)
     for start in range(0, total, PAIRS_AT_ONCE):
         at = np.arange(start, min(start + PAIRS_AT_ONCE, total))

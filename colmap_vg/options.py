@@ -1,4 +1,4 @@
-"""Options of reading, solving and mapping: frozen dataclasses, checked when they are made."""
+"""Options of reading, solving, feature extraction and mapping: frozen dataclasses, checked on creation."""
 
 from dataclasses import dataclass, field, fields
 from os import PathLike
@@ -21,22 +21,22 @@ def _number(default: float, low: float, high: float = float("inf")) -> Any:
 
 
 class _Checked:
-    """Checks literals, booleans, integers and ranges of a frozen dataclass's fields."""
+    """Base class that checks the literals, booleans, numbers and ranges of a dataclass's fields on creation."""
 
     @classmethod
     def given(cls, options: Self | None) -> Self:
-        """The options, or the defaults for None.
+        """Return the options, or the defaults for None.
 
         Raises
         ------
         OptionError
-            They are of another kind, for instance a dict or pycolmap's.
+            `options` has another type, for instance dict or one of pycolmap's.
         """
         if options is None:
             return cls()
         if not isinstance(options, cls):
             hint = (
-                f"write {cls.__name__}(**options)" if isinstance(options, dict) else f"make a colmap_vg.{cls.__name__}"
+                f"write {cls.__name__}(**options)" if isinstance(options, dict) else f"use a colmap_vg.{cls.__name__}"
             )
             raise OptionError(f"options must be a {cls.__name__}, found a {type(options).__name__}: {hint}")
         return options
@@ -60,63 +60,66 @@ class _Checked:
 
 @dataclass(frozen=True)
 class ReadOptions(_Checked):
-    """How a viewing graph is read from a database."""
+    """Options of reading a viewing graph from a database."""
 
-    min_num_inliers: int = _number(15, 5)  # matches; edges with fewer are in the graph but not used
+    min_num_inliers: int = _number(15, 5)  # verified matches; edges with fewer are in the graph but not used
     trust_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: decided from the two-view geometries
-    find_distortion: bool = True  # a radial term for cameras of a radial model that have no distortion, if matches tell
-    max_num_inliers_per_edge: int = _number(0, 0)  # matches kept as bearings per edge, spread over the image; 0: all
-    excluded_pairs_path: str | PathLike[str] | None = None  # file with two image names a line: pairs not to be used
-    trusted_pairs_path: str | PathLike[str] | None = None  # the same: pairs that no filter may drop
+    find_distortion: bool = True  # estimate a radial term for cameras without distortion whose model has one
+    max_num_inliers_per_edge: int = _number(0, 0)  # matches kept as bearings per edge, evenly from its list; 0: all
+    excluded_pairs_path: str | PathLike[str] | None = None  # file with two image names per line: pairs not to use
+    trusted_pairs_path: str | PathLike[str] | None = None  # file with two image names per line: pairs never dropped
     random_seed: int = _number(0, 0)
 
 
 @dataclass(frozen=True)
 class SolveOptions(_Checked):
-    """How a viewing graph is solved. The paper's chain: chordal rotation averaging, no gate, 1DSfM."""
+    """Options of solving a viewing graph.
+
+    The paper's pipeline is chordal rotation averaging, no rotation gate, and the 1DSfM filter.
+    """
 
     method: Method = "epipolar"
     rotation_averaging: RotationAveraging = "robust"
-    certify_rotations: bool = False  # say in the caveats whether chordal rotations are the global optimum (eigenvalue)
+    certify_rotations: bool = False  # warn whether chordal rotations are a global optimum (by an eigenvalue)
     outlier_filter: OutlierFilter = "robust"
-    rotation_gate_deg: float = _number(10.0, 0.0, 180.0)  # degrees; edges beyond it are dropped; 0: no gate
-    one_dsfm_threshold: float = _number(0.1, 0.0)  # broken weight, mean |projection|
-    one_dsfm_num_directions: int = _number(48, 1)
-    direction_gate_deg: float = _number(15.0, 0.0, 180.0)  # degrees; robust filter of directions; 0: no gate
+    rotation_gate_deg: float = _number(10.0, 0.0, 180.0)  # degrees; edges with a larger error are dropped; 0: no gate
+    one_dsfm_threshold: float = _number(0.1, 0.0)  # maximum broken weight, mean |projection|, dimensionless
+    one_dsfm_num_directions: int = _number(48, 1)  # random projection directions
+    direction_gate_deg: float = _number(15.0, 0.0, 180.0)  # degrees; gate of the robust direction filter; 0: no gate
     edge_weights: Literal["unit", "inliers", "information"] = "information"  # inliers: sqrt(number), planar a third
-    accelerate: bool = True  # Anderson acceleration of those of 1C, 1O, 2C, 2O, 2W; same fixed point
+    accelerate: bool = True  # Anderson acceleration of 1C, 1O, 2C, 2O, 2W; same fixed point
     max_num_iterations: int = _number(1000, 1)  # outer iterations of 1C, 1O, 2C, 2O, 2W
     convergence_tolerance: float = _number(1e-6, 0.0, 1.0)  # relative change of positions between outer iterations
-    covariances: bool = False  # of the cameras that the epipolar adjustment finds; a fifth of the solver's time more
-    refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal was not given
+    covariances: bool = False  # compute those of poses in the epipolar adjustment; adds a fifth to the solver's time
+    refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal length was not given
     max_matches_per_edge: int = _number(500, 0)  # matches in the epipolar adjustment, spread over the image; 0: all
     random_seed: int = _number(0, 0)
 
 
 @dataclass(frozen=True)
 class FeatureOptions(_Checked):
-    """How a folder of photographs becomes a database. Features are SIFT, on the CPU."""
+    """Options of feature extraction and matching. Features are SIFT, computed on the CPU."""
 
     camera_model: str = "SIMPLE_RADIAL"
-    camera_params: tuple[float, ...] = ()  # in the model's order, pixels; empty: from EXIF, else guessed
-    camera_mode: CameraMode = "auto"  # auto: COLMAP's, which shares a camera only where EXIF says so
-    matching: Matching = "auto"  # exhaustive, in folders of more than 20 images selected: by their largest features
-    image_list_path: str | PathLike[str] | None = None  # file with one image name a line; None: all of the folder
-    mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png or NAME.jpg of image NAME; black hides
-    max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are shrunk for extraction; -1: COLMAP's
+    camera_params: tuple[float, ...] = ()  # in the order of COLMAP's model, pixels; empty: from EXIF, else guessed
+    camera_mode: CameraMode = "auto"  # auto: COLMAP's, which shares a camera only if EXIF data agree
+    matching: Matching = "auto"  # auto: exhaustive for up to 20 images, else selected (by the largest features)
+    image_list_path: str | PathLike[str] | None = None  # file with one image name per line; None: all in the folder
+    mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png or NAME.jpg of image NAME; black is masked
+    max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are resized; -1: COLMAP's default
     max_num_features: int = _number(8192, 1)  # per image
-    sequential_overlap: int = _number(10, 1)  # images; each is matched with so many followers
+    sequential_overlap: int = _number(10, 1)  # images; each is matched with this many that follow it
     num_threads: int = _number(-1, -1)  # -1: all cores
     random_seed: int = _number(0, 0)
 
     @classmethod
     def of_quality(cls, quality: Quality, **options: Any) -> "FeatureOptions":
-        """The options of a preset, save for those that are given.
+        """Make the options of a preset, with the given ones replaced.
 
         Raises
         ------
         OptionError
-            There is no such preset, or an option is outside its range.
+            The preset is unknown, or an option is outside its range.
         """
         if quality not in QUALITIES:
             raise OptionError(f"quality is {quality!r}; choose one of {', '.join(QUALITIES)}")
@@ -129,20 +132,20 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     "high": {},
     "extreme": {"max_image_size": 100_000, "max_num_features": 16384, "matching": "exhaustive"},
 }
-"""Fields of `FeatureOptions` for each preset; the others keep their defaults."""
+"""Values of `FeatureOptions` for each preset; other fields keep their defaults."""
 
 
 @dataclass(frozen=True)
 class MappingOptions(_Checked):
-    """How a database becomes models."""
+    """Options of mapping a database."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
     solve: SolveOptions = field(default_factory=SolveOptions)
     ba_refine_focal_length: bool = True
     ba_refine_principal_point: bool = False
     ba_refine_extra_params: bool = True
-    share_cameras: bool = True  # photographs of one size that start with one calibration share a lens
+    share_cameras: bool = True  # share intrinsics between images of the same size and initial calibration
     extract_colors: bool = True
     overwrite: bool = False
     num_threads: int = _number(-1, -1)  # -1: all cores
-    random_seed: int = _number(0, 0)  # of all stages, in place of those in read and solve
+    random_seed: int = _number(0, 0)  # of all stages; replaces those of read and solve

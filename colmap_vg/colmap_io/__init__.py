@@ -1,1 +1,1 @@
-"""From COLMAP databases to view graphs, and from pose solutions to reconstructions."""
+"""Read COLMAP databases as arrays, and turn pose solutions into COLMAP reconstructions."""

@@ -1,4 +1,4 @@
-"""COLMAP cameras: unit rays of keypoints, calibration matrices, other focal lengths."""
+"""Operations on COLMAP cameras: bearings of keypoints, calibration matrices, changes of focal length and distortion."""
 
 import numpy as np
 import pycolmap
@@ -9,12 +9,14 @@ from colmap_vg.geometry.directions import normalized
 Array = NDArray[np.float64]
 
 MAX_ANGLE_DEG = 70.0
+"""Maximum angle between a ray and the optical axis for undistorted pixels, degrees."""
 MAX_REPROJECTION_PX = 0.5
-"""A ray that does not project back on its keypoint is wrong: some models return such rays past their field of view."""
+"""Maximum distance between a keypoint and the projection of its ray, pixels: some camera models return wrong rays
+outside their field of view."""
 
 
 def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Unit rays of pixels in the camera's frame.
+    """Compute the unit rays of pixels in the camera's frame.
 
     Parameters
     ----------
@@ -25,9 +27,9 @@ def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Arr
     Returns
     -------
     bearings : (k, 3) array
-        The optical axis where the camera model has no ray.
+        Unit vectors; the optical axis where the camera model gives no ray.
     valid : (k,) bool array
-        Rays in front of the camera that project back on their pixels.
+        Whether the ray is in front of the camera and projects back to its pixel.
     """
     points = np.ascontiguousarray(points, dtype=float)
     rays = np.ones((len(points), 3))
@@ -36,7 +38,7 @@ def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Arr
     rays[:, :2] = camera.cam_from_img(points)
     valid = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
     rays[~valid] = (0.0, 0.0, 1.0)
-    # Also without distortion: a fisheye's pixel beyond 90 degrees has no ray in front, and gets a wrong one in silence.
+    # Fisheyes without distortion need this, too: they return wrong rays for pixels beyond 90 degrees without an error.
     again = np.asarray(camera.img_from_cam(rays), dtype=float)
     with np.errstate(invalid="ignore"):
         valid &= np.abs(again - points).max(axis=1) <= MAX_REPROJECTION_PX
@@ -44,7 +46,7 @@ def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Arr
 
 
 def undistorted_pixels(camera: "pycolmap.Camera", points: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Where a pinhole camera with the same focal lengths and principal point would see what a camera sees.
+    """Undistort pixels, to those of a pinhole camera with the same focal lengths and principal point.
 
     Parameters
     ----------
@@ -55,9 +57,10 @@ def undistorted_pixels(camera: "pycolmap.Camera", points: Array) -> tuple[Array,
     Returns
     -------
     pixels : (k, 2) array
-        NaN where there is no ray.
+        NaN where `valid` is False.
     valid : (k,) bool array
-        Where there is a ray, not more than `MAX_ANGLE_DEG` from the optical axis: beyond, a pixel of noise is many.
+        Whether the pixel has a ray, at most `MAX_ANGLE_DEG` from the optical axis: beyond, undistortion amplifies
+        noise.
     """
     points = np.asarray(points, dtype=float)
     if camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
@@ -79,10 +82,10 @@ def calibration_matrix(camera: "pycolmap.Camera", focal_scale: float = 1.0) -> A
 
 
 def with_focal_scale(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camera":
-    """Copy of a camera with its focal lengths multiplied, its distortion kept as seen in the image.
+    """Copy a camera with its focal lengths multiplied and the same distortion in pixels.
 
-    In the models whose distortion is a polynomial of the normalised radius, the radius grows as the focal shrinks: the
-    coefficient of the 2k-th power goes with ``scale^2k``.
+    In models whose distortion is a polynomial of the normalised radius, which is inversely proportional to the focal
+    length, the coefficient of the 2k-th power is multiplied by ``scale^2k``.
     """
     copy = pycolmap.Camera(camera.todict())
     params = np.array(copy.params, dtype=float)
@@ -95,25 +98,28 @@ def with_focal_scale(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camer
 
 
 def has_radial_term(camera: "pycolmap.Camera") -> bool:
-    """Whether the camera's model can take a radial term: polynomials of the normalised radius, and FOV."""
+    """Whether the camera's model has a radial term: the polynomials of the normalised radius, and FOV."""
     return camera.model_name in _DISTORTED_BY_POLYNOMIAL or camera.model_name == "FOV"
 
 
 def is_undistorted(camera: "pycolmap.Camera") -> bool:
-    """Whether a camera that can take a radial term has no distortion; FOV as COLMAP sets it up counts."""
+    """Whether a camera whose model has a radial term has no distortion; COLMAP's initial FOV camera counts as such."""
     largest = max((abs(camera.params[k]) for k in camera.extra_params_idxs()), default=0.0)
     return largest <= (MIN_FOV_ANGLE if camera.model_name == "FOV" else 0.0)
 
 
 def with_radial_term(camera: "pycolmap.Camera", term: float) -> "pycolmap.Camera":
-    """Copy of a camera with a radial term more: exact for a polynomial that had none, to first order elsewhere.
+    """Copy a camera and add a radial term to its distortion.
+
+    The result is exact for a polynomial without distortion, and correct to first order otherwise.
 
     Parameters
     ----------
     camera : pycolmap.Camera
-        With a radial term, see :func:`has_radial_term`.
+        Of a model with a radial term, see :func:`has_radial_term`.
     term : float
-        Of COLMAP's polynomial in normalised coordinates. FOV bends inwards only: what is positive is left out.
+        Of COLMAP's polynomial in normalised coordinates, dimensionless. FOV has barrel distortion only: what would make
+        its distortion positive is dropped.
     """
     copy = pycolmap.Camera(camera.todict())
     params = np.array(copy.params, dtype=float)
@@ -131,7 +137,7 @@ def with_radial_term(camera: "pycolmap.Camera", term: float) -> "pycolmap.Camera
 
 
 MIN_FOV_ANGLE = 0.01
-"""Radians; COLMAP's FOV lens without distortion."""
+"""Parameter of COLMAP's FOV camera without distortion, radians."""
 _DISTORTED_BY_POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 _RADIAL_POWERS: dict[str, tuple[tuple[int, int], ...]] = {
@@ -142,4 +148,5 @@ _RADIAL_POWERS: dict[str, tuple[tuple[int, int], ...]] = {
     "OPENCV": ((4, 2), (5, 4), (6, 1), (7, 1)),
     "FULL_OPENCV": ((4, 2), (5, 4), (6, 1), (7, 1), (8, 6), (9, 2), (10, 4), (11, 6)),
 }
-"""(index of the parameter, power of the normalised radius it goes with); tangential terms are of first order."""
+"""For each camera model, the index of each distortion parameter and the power of the normalised radius that it is the
+coefficient of; tangential terms are of first order."""

@@ -1,7 +1,7 @@
-"""COLMAP databases as files: checked without touching them, copied before anything is opened for writing.
+"""Open COLMAP databases without modifying them, check them, and copy them for pycolmap.
 
 pycolmap's ``Database.open`` changes a few bytes of any database, migrates old ones and creates missing ones, so the
-user's file is only ever read by sqlite, and pycolmap gets a copy.
+user's file is only read through sqlite, and pycolmap opens a copy.
 """
 
 import shutil
@@ -25,7 +25,7 @@ _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 @contextmanager
 def reading(database_path: str | PathLike[str]) -> Iterator[sqlite3.Connection]:
-    """A connection that reads a database without changing it or leaving files beside it.
+    """Open a read-only connection to a database, without changing it or leaving files beside it.
 
     Raises
     ------
@@ -37,13 +37,13 @@ def reading(database_path: str | PathLike[str]) -> Iterator[sqlite3.Connection]:
     with ExitStack() as stack:
         before = _state(path)
         if before.sides:
-            # What a writer has not merged yet, or may have to take back, stands beside the file: only a copy of both
-            # shows the last finished transaction.
+            # Changes that a writer has not merged yet, or may roll back, are in a file beside the database: only a
+            # copy of both shows the last committed transaction.
             folder = stack.enter_context(_temporary_folder(path))
             uri = f"file:{quote(str(_copied(path, folder / 'database.db')))}?mode=rw"
         else:
-            # In WAL mode every reader leaves files beside the database unless told that nothing changes; without a
-            # -wal file nobody has it open. Elsewhere readers leave nothing and mind the writers' locks.
+            # In WAL mode every reader leaves files beside the database unless it is opened as immutable; without a
+            # -wal file no process has it open. In other modes readers leave no files and respect the writers' locks.
             uri = f"file:{quote(str(path.resolve()))}?mode=ro{'&immutable=1' if in_wal_mode else ''}"
         try:
             connection = stack.enter_context(closing(sqlite3.connect(uri, timeout=PATIENCE, uri=True)))
@@ -53,15 +53,15 @@ def reading(database_path: str | PathLike[str]) -> Iterator[sqlite3.Connection]:
         except sqlite3.Error as error:
             if "locked" in str(error):
                 raise _written_by_another(path) from error
-            raise DatabaseError(f"{database_path}: the database cannot be read ({error}); make it again") from error
-        except (OverflowError, UnicodeDecodeError) as error:  # also of sqlite's own message, when it quotes the damage
-            raise DatabaseError(f"{database_path}: the database is damaged ({error}); make it again") from error
+            raise DatabaseError(f"{database_path}: the database cannot be read ({error}); create it again") from error
+        except (OverflowError, UnicodeDecodeError) as error:  # sqlite's message may quote damaged bytes, too
+            raise DatabaseError(f"{database_path}: the database is damaged ({error}); create it again") from error
         if not before.sides and _state(path) != before:
             raise _written_by_another(path)
 
 
 def check_database(database_path: str | PathLike[str]) -> None:
-    """Refuse what cannot be mapped before any work is done, without changing the file.
+    """Raise an error for a database that cannot be mapped; the file is not changed.
 
     Raises
     ------
@@ -71,18 +71,18 @@ def check_database(database_path: str | PathLike[str]) -> None:
     with reading(database_path) as connection:
         (num_images,) = connection.execute("SELECT COUNT(*) FROM images").fetchone()
         if num_images == 0:
-            raise DatabaseError(f"{database_path}: holds no images; extract features first")
+            raise DatabaseError(f"{database_path}: contains no images; extract features first")
         (num_pairs,) = connection.execute("SELECT COUNT(*) FROM two_view_geometries WHERE rows > 0").fetchone()
         if num_pairs == 0:
             raise DatabaseError(
-                f"{database_path}: holds {num_images} images but no verified pairs; match them first"
+                f"{database_path}: contains {num_images} images but no verified pairs; match them first"
                 " (colmap exhaustive_matcher), or verify the matches (colmap geometric_verifier)"
             )
         _refuse_rigs(connection, Path(database_path))
 
 
 def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:
-    """Copy of a checked database in a folder, for pycolmap to open.
+    """Copy a checked database to a folder, for pycolmap to open.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class _State:
-    """Of a database's file, and the files beside it that hold a part of what it says."""
+    """State of a database file (inode, size, time), and the names of sqlite's files with changes beside it."""
 
     file: tuple[int, int, int]
     sides: tuple[str, ...]
@@ -115,18 +115,20 @@ def _temporary_folder(path: Path) -> Iterator[Path]:
     try:
         folder = TemporaryDirectory()
     except OSError as error:
-        raise DatabaseError(f"{path}: cannot be copied to the folder for temporary files ({error.strerror})") from error
+        raise DatabaseError(
+            f"{path}: cannot be copied to the folder for temporary files ({error.strerror}); set TMPDIR to another one"
+        ) from error
     with folder as name:
         yield Path(name)
 
 
 def _copied(path: Path, target: Path) -> Path:
-    """Copy of a database that no writer touched meanwhile."""
+    """Copy a database, again if a writer changed it meanwhile."""
     deadline = time.monotonic() + PATIENCE
     while True:
         before = _state(path)
         try:
-            # A killed job's leftovers would be taken for changes of the new copy.
+            # sqlite would read files that a killed job left as changes of the new copy.
             for leftover in target.parent.glob(target.name + "*"):
                 leftover.unlink()
             shutil.copyfile(path, target)
@@ -146,11 +148,11 @@ def _copied(path: Path, target: Path) -> Path:
 
 
 def _written_by_another(path: Path) -> DatabaseError:
-    return DatabaseError(f"{path}: another process is writing to the database; wait until it has ended")
+    return DatabaseError(f"{path}: another process is writing to the database; wait until it has finished")
 
 
 def _check_file(path: Path) -> bool:
-    """Whether the file, which must be one of sqlite's, is in WAL mode."""
+    """Check that the file is an SQLite database, and return whether it is in WAL mode."""
     if path.is_dir():
         raise DatabaseError(f"{path}: is a folder, expected a COLMAP database file")
     try:
@@ -161,7 +163,7 @@ def _check_file(path: Path) -> bool:
     if not head:
         raise DatabaseError(f"{path}: is empty; extract and match features first")
     if not head.startswith(_SQLITE_MAGIC):
-        raise DatabaseError(f"{path}: is no SQLite file; give the path of a COLMAP database")
+        raise DatabaseError(f"{path}: is not an SQLite file; give the path of a COLMAP database")
     return head[18:20] != b"\x01\x01"  # the file format's read and write versions: 1 legacy, 2 WAL
 
 
@@ -169,11 +171,11 @@ def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
     found = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     missing = [name for name in REQUIRED_TABLES if name not in found]
     if missing:
-        raise DatabaseError(f"{path}: is no COLMAP database, it has no table {', '.join(missing)}")
+        raise DatabaseError(f"{path}: is not a COLMAP database, it has no table {', '.join(missing)}")
 
 
 def _refuse_rigs(connection: sqlite3.Connection, path: Path) -> None:
-    """Setting the pose of one image of a rig moves the others: until rigs are solved as such, none is better."""
+    """Raise an error for rigs of several sensors: they are not supported, since setting one pose moves the others."""
     tables = connection.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'rig_sensors'").fetchone()
     if tables[0] == 0:  # an older schema
         return
@@ -181,5 +183,5 @@ def _refuse_rigs(connection: sqlite3.Connection, path: Path) -> None:
     if rig is not None:
         raise DatabaseError(
             f"{path}: rig {rig[0]} has {rig[1]} sensors; rigs are not supported yet: map the images with"
-            " pycolmap.global_mapping, or make the database without a rig"
+            " pycolmap.global_mapping, or create the database without a rig"
         )

@@ -1,4 +1,4 @@
-"""A database's cameras, rigs, frames and images as a `pycolmap.Reconstruction` without poses."""
+"""Load a database's cameras, rigs, frames and images into a `pycolmap.Reconstruction` without poses."""
 
 import pycolmap
 
@@ -6,12 +6,12 @@ from colmap_vg.errors import DatabaseError
 
 
 def loaded_reconstruction(cache: "pycolmap.DatabaseCache") -> "pycolmap.Reconstruction":
-    """All cameras, rigs, frames and images of a database, without poses.
+    """Make a reconstruction with all cameras, rigs, frames and images of a database, without poses.
 
     Raises
     ------
     DatabaseError
-        They contradict each other.
+        The rigs, frames and images contradict each other.
     """
     reconstruction = pycolmap.Reconstruction()
     try:

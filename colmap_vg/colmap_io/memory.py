@@ -1,4 +1,4 @@
-"""How many matches of a database fit into memory: a huge one is thinned or refused before the kernel steps in."""
+"""Limit the number of matches to what fits into memory, before the kernel kills the process."""
 
 import resource
 from pathlib import Path
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 IntArray = NDArray[np.int64]
 
 BYTES_PER_MATCH = 700
-"""Peak of reading and solving, measured on three sets: 400 to 680."""
+"""Peak memory of reading and solving per match, bytes; measured 400 to 680 on three sets."""
 BYTES_PER_MATCH_IN_COLMAP = 60
-"""Of COLMAP's matches and correspondence graph, which hold all of a database's matches."""
+"""Bytes per match of COLMAP's matches and correspondence graph, which hold all matches of a database."""
 USABLE_SHARE = 0.7
-"""Of the memory that is free; other processes and what is built on the matches need the rest."""
+"""Share of the free memory to use; other processes and the data built from the matches need the rest."""
 MIN_MATCHES_PER_PAIR = 50
-"""Fewer say too little of a pair to be a fair sample."""
+"""Minimum number of matches per pair after sampling; fewer are not representative of the pair."""
 
 _MEMINFO = Path("/proc/meminfo")
 _CGROUPS = (
@@ -25,7 +25,10 @@ _CGROUPS = (
 
 
 def available_memory() -> float:
-    """Bytes that this process may still take, by the machine, its control group and its own limit; else infinite."""
+    """Memory that this process can still allocate, bytes; infinite if unknown.
+
+    It is the least that the machine, the control group and the process's own limit leave.
+    """
     found = [np.inf]
     for line in _text(_MEMINFO).splitlines():
         if line.startswith("MemAvailable:"):
@@ -42,26 +45,26 @@ def available_memory() -> float:
 
 
 def affordable_matches_per_pair(num_matches: IntArray, memory: float) -> int | None:
-    """Matches that each pair may keep.
+    """Maximum number of matches per pair that fits into memory.
 
     Parameters
     ----------
     num_matches : (m,) int array
-        Of each pair.
+        Number of matches of each pair.
     memory : float
-        Bytes that are free.
+        Free memory, bytes.
 
     Returns
     -------
     int or None
-        0 when all fit; None when not even the fewest that are of use do, or when COLMAP could not hold them all.
+        0 if all matches fit; None if the maximum is below `MIN_MATCHES_PER_PAIR`, or COLMAP could not hold all matches.
     """
     total, budget = float(num_matches.sum()), USABLE_SHARE * memory
     if total * BYTES_PER_MATCH <= budget:
         return 0
     if total * BYTES_PER_MATCH_IN_COLMAP > budget:
         return None
-    # With n sorted, a cap of n_k costs n_1 + ... + n_k + (m - k) n_k matches: rising in k.
+    # With n sorted, a cap of n_k keeps n_1 + ... + n_k + (m - k) n_k matches, which increases with k.
     ordered = np.sort(num_matches)
     before = np.concatenate([[0], np.cumsum(ordered)])[:-1]
     cost = before + (len(ordered) - np.arange(len(ordered))) * ordered

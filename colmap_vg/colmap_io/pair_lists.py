@@ -1,4 +1,4 @@
-"""Lists of image pairs from the user: pairs to leave out, and pairs to keep whatever contradicts them."""
+"""Read the user's lists of image pairs: pairs to exclude, and trusted pairs that are never removed."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -11,12 +11,13 @@ from colmap_vg.errors import DataFileError
 
 
 def read_pair_list(path: str | PathLike[str]) -> list[tuple[str, str]]:
-    """Pairs of image names, two names a line as COLMAP's match lists have them; a tab lets names hold spaces.
+    """Read pairs of image names from a text file.
 
     Parameters
     ----------
     path : path
-        Empty lines and lines that start with ``#`` are skipped.
+        Two names per line, as in COLMAP's match lists, separated by a tab if names contain spaces. Empty lines and
+        lines that start with ``#`` are skipped.
 
     Returns
     -------
@@ -25,7 +26,7 @@ def read_pair_list(path: str | PathLike[str]) -> list[tuple[str, str]]:
     Raises
     ------
     DataFileError
-        The file cannot be read, or a line does not hold two names.
+        The file cannot be read, or a line does not contain two names.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="surrogateescape").splitlines()
@@ -42,12 +43,14 @@ def read_pair_list(path: str | PathLike[str]) -> list[tuple[str, str]]:
 
 
 def listed_edges(path: str | PathLike[str] | None, names: Sequence[str], edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which edges (m, 2) a list of pairs names, in either order: (m,).
+    """Whether each edge (m, 2) is in a list of pairs, with its names in either order, (m,).
+
+    Pairs in the list without verified matches are ignored.
 
     Raises
     ------
     DataFileError
-        As :func:`read_pair_list`, or a name is no image of the database. Pairs without verified matches are ignored.
+        As :func:`read_pair_list`, or a name is not that of an image of the database.
     """
     listed = np.zeros(len(edges), dtype=bool)
     if path is None:
@@ -56,7 +59,7 @@ def listed_edges(path: str | PathLike[str] | None, names: Sequence[str], edges: 
     pairs = read_pair_list(path)
     unknown = sorted({name for pair in pairs for name in pair if name not in row_of})
     if unknown:
-        raise DataFileError(f"{path}: {len(unknown)} names are no images of the database (first: {unknown[0]!r})")
+        raise DataFileError(f"{path}: {len(unknown)} names are not images of the database (first: {unknown[0]!r})")
     keys = np.array([sorted((row_of[a], row_of[b])) for a, b in pairs], dtype=np.int64).reshape(-1, 2)
     n = len(names)
     own = np.sort(edges, axis=1)

@@ -1,4 +1,4 @@
-"""COLMAP's own log, kept off standard error while we work."""
+"""Keep COLMAP's log off standard error while a job runs."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ import pycolmap
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Let COLMAP write errors only, unless its log was asked for (``pycolmap.logging.verbose_level``)."""
+    """Let COLMAP log errors only, unless the user enabled its log (``pycolmap.logging.verbose_level``)."""
     level, errors = pycolmap.logging.minloglevel, pycolmap.logging.Level.ERROR.value
     if pycolmap.logging.verbose_level == 0 and level < errors:
         pycolmap.logging.minloglevel = errors

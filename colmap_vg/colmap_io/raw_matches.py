@@ -1,4 +1,4 @@
-"""Matches of a database as they were before verification, and which images were compared."""
+"""Read a database's matches before verification, and the pairs of images that were compared."""
 
 import sqlite3
 from dataclasses import replace
@@ -15,7 +15,7 @@ BoolArray = NDArray[np.bool_]
 
 
 def raw_matches(connection: sqlite3.Connection, tables: DatabaseTables, pair: tuple[int, int]) -> IntArray | None:
-    """Matches (k, 2) of two rows of images before verification; None where they are missing or damaged."""
+    """Matches (k, 2) of a pair, given as rows of images, before verification; None if they are missing or damaged."""
     image_id1, image_id2 = (int(tables.image_ids[image]) for image in pair)
     found = connection.execute(
         "SELECT rows, cols, data FROM matches WHERE pair_id = ? AND typeof(data) = 'blob'",
@@ -29,7 +29,7 @@ def raw_matches(connection: sqlite3.Connection, tables: DatabaseTables, pair: tu
 
 
 def with_raw_matches(tables: DatabaseTables, database_path: str | PathLike[str], marked: BoolArray) -> DatabaseTables:
-    """The tables without the matrices of marked pairs (m,), and with their matches before verification."""
+    """Replace the matches of marked pairs (m,) by those before verification, and their matrices by NaN."""
     kept = [tables.matches[a:b] for a, b in zip(tables.offsets[:-1], tables.offsets[1:], strict=True)]
     with reading(database_path) as connection:
         for row in np.flatnonzero(marked).tolist():
@@ -44,10 +44,10 @@ def with_raw_matches(tables: DatabaseTables, database_path: str | PathLike[str],
 
 
 def compared_pairs(database_path: str | PathLike[str]) -> IntArray:
-    """Ids of images (k, 2) that were compared, matched or not: COLMAP stores pairs without matches, too."""
+    """Image ids (k, 2) of the pairs that were compared, matched or not: COLMAP stores pairs without matches, too."""
     with reading(database_path) as connection:
         tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-        asked = [f"SELECT pair_id FROM {name}" for name in ("matches", "two_view_geometries") if name in tables]
-        found = connection.execute(" UNION ".join(asked)).fetchall()
+        queries = [f"SELECT pair_id FROM {name}" for name in ("matches", "two_view_geometries") if name in tables]
+        found = connection.execute(" UNION ".join(queries)).fetchall()
     pair_ids = np.array(found, dtype=np.int64).reshape(-1)
     return np.stack([pair_ids // MAX_NUM_IMAGES, pair_ids % MAX_NUM_IMAGES], axis=1)

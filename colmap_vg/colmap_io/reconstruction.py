@@ -1,4 +1,4 @@
-"""From a pose solution to a `pycolmap.Reconstruction` with the database's cameras, rigs, frames, images and ids."""
+"""Turn a pose solution into a `pycolmap.Reconstruction` with the database's cameras, rigs, frames, images and ids."""
 
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -27,27 +27,28 @@ def loaded_cache(
     without_pairs: Sequence[tuple[int, int]] = (),
     graph: ViewGraph | None = None,
 ) -> Iterator[tuple["pycolmap.DatabaseCache", dict[int, int]]]:
-    """COLMAP's view of a database, read from a copy that is gone afterwards: opening a database changes the file.
+    """Load a database into a COLMAP cache from a temporary copy, since pycolmap changes databases that it opens.
 
     Parameters
     ----------
     database_path : path
     work_folder : Path
-        For the copy.
+        Folder for the copy.
     min_num_matches : int
+        Pairs with fewer matches are not loaded.
     shared : sequence of sequence of int
-        Cameras to be merged, see `merge_cameras`.
+        Groups of ids of cameras to merge, see `merge_cameras`.
     without_pairs : sequence of (int, int)
-        Image ids of pairs whose matches are left out.
+        Image ids of pairs that are not loaded.
     graph : ViewGraph, optional
-        As read from the database: the matches of pairs that were verified anew take the place of the database's, and
-        radial terms that were found bend its cameras.
+        As read from the database: the matches of pairs that were verified again replace the database's, and its
+        cameras get the radial terms that were found.
 
     Yields
     ------
     cache : pycolmap.DatabaseCache
     replaced : dict of int to int
-        For each camera that was merged into another one, that one.
+        For each camera that was merged into another one, the id of that one.
 
     Raises
     ------
@@ -60,17 +61,17 @@ def loaded_cache(
             replaced: dict[int, int] = {}
             if graph is not None:
                 _replace_matches(copy, graph)
-                _bend_cameras(copy, graph)
+                _add_radial_terms(copy, graph)
             if without_pairs:
                 _delete_pairs(copy, without_pairs)
             if shared:
-                pycolmap.Database.open(copy).close()  # an old schema becomes the current one
+                pycolmap.Database.open(copy).close()  # migrates an old schema to the current one
                 replaced = merge_cameras(copy, shared)
             with pycolmap.Database.open(copy) as database:
                 options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches, load_all_images=True)
                 cache = pycolmap.DatabaseCache.create(database, options)
         except (ValueError, RuntimeError, IndexError, MemoryError, sqlite3.Error) as error:
-            # Out of memory, too: a damaged row may ask for any amount of it.
+            # MemoryError, too, since a damaged row may request any amount of memory.
             raise DatabaseError(f"{database_path}: pycolmap cannot read the database ({error})") from error
         yield cache, replaced
     finally:
@@ -79,7 +80,7 @@ def loaded_cache(
 
 
 def _replace_matches(copy: Path, graph: ViewGraph) -> None:
-    """Give pairs that were verified anew their matches, and a configuration that COLMAP takes."""
+    """Store the new matches of pairs that were verified again, with a configuration that COLMAP loads."""
     offsets, keypoints1, keypoints2 = graph.inlier_offsets, graph.inlier_keypoints1, graph.inlier_keypoints2
     if graph.verified_anew is None or offsets is None or keypoints1 is None or keypoints2 is None:
         return
@@ -94,8 +95,8 @@ def _replace_matches(copy: Path, graph: ViewGraph) -> None:
         connection.executemany("UPDATE two_view_geometries SET rows = ?, data = ?, config = ? WHERE pair_id = ?", rows)
 
 
-def _bend_cameras(copy: Path, graph: ViewGraph) -> None:
-    """Give cameras the radial terms that were found on reading."""
+def _add_radial_terms(copy: Path, graph: ViewGraph) -> None:
+    """Store the radial terms that were found on reading in the cameras."""
     if graph.found_radial_terms is None or graph.camera_ids is None:
         return
     with pycolmap.Database.open(copy) as database:
@@ -113,14 +114,14 @@ def _delete_pairs(copy: Path, pairs: Sequence[tuple[int, int]]) -> None:
 def reconstruction_from_solution(
     cache: "pycolmap.DatabaseCache", solution: PoseSolution, graph: ViewGraph, component: int = 0
 ) -> "pycolmap.Reconstruction":
-    """Reconstruction of one component's poses, without points.
+    """Make a reconstruction with the poses of one component, without points.
 
     Parameters
     ----------
     cache : pycolmap.DatabaseCache
         Of the database that the graph was read from.
     solution : PoseSolution
-        Its focal factors go on top of the graph's focal lengths.
+        Its focal factors multiply the graph's focal lengths.
     graph : ViewGraph
     component : int
 
@@ -138,7 +139,7 @@ def reconstruction_from_solution(
             if reconstruction.exists_camera(camera_id):
                 camera = reconstruction.camera(camera_id)
                 factor = float(focal * scale / camera.mean_focal_length())
-                # Not touched where nothing changed, so that given calibrations stay as they are to the last bit.
+                # Left alone where nothing changed, so that given calibrations stay identical to the last bit.
                 if abs(factor - 1.0) > 1e-12:
                     camera.params = with_focal_scale(camera, factor).params.tolist()
                 if term != 0.0:
@@ -154,15 +155,15 @@ def reconstruction_from_solution(
 
 
 def write_model(reconstruction: "pycolmap.Reconstruction", folder: Path) -> None:
-    """Write a model in COLMAP's binary format, and make sure that all of it is there.
+    """Write a model in COLMAP's binary format, and check that the files are complete.
 
-    COLMAP does not look whether its files could be written: on a full disk they end early, and it reads them all the
-    same. So their sizes are held against what the model must take.
+    COLMAP does not check whether its files could be written: on a full disk they are truncated, and it reads them
+    without an error. So their sizes are compared with the minimum size of the model.
 
     Raises
     ------
     OutputError
-        A file cannot be written, or not in full.
+        A file cannot be written, or is incomplete.
     """
     try:
         reconstruction.write(folder)
@@ -174,12 +175,12 @@ def write_model(reconstruction: "pycolmap.Reconstruction", folder: Path) -> None
     if short:
         raise OutputError(
             f"{folder / short[0]} has {found.get(short[0], 0)} of {expected[short[0]]} bytes: the disk is full, or a"
-            " limit on the size of files was reached; make room or choose another output_path"
+            " limit on the size of files was reached; free disk space or choose another output_path"
         )
 
 
 def _file_sizes(reconstruction: "pycolmap.Reconstruction") -> dict[str, int]:
-    """Bytes of the files that hold cameras, images and points: COLMAP's ``*.bin``, all numbers of fixed width."""
+    """Sizes of the files of a model in COLMAP's binary format, bytes; all its numbers have a fixed width."""
     cameras = reconstruction.cameras.values()
     images = [reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()]
     points = reconstruction.points3D.values()

@@ -1,8 +1,8 @@
-"""One calibration for photographs that start with the same one and show no sign of different lenses.
+"""Share intrinsics between images with the same initial calibration.
 
-COLMAP gives each photograph without EXIF a camera of its own, and most are too weak to calibrate alone. While the
-model is built they share one, in a copy of the database; the finished model has the database's own cameras again, with
-equal parameters.
+COLMAP gives each image without EXIF data its own camera, and most images have too few observations to calibrate one.
+While a model is built such images share a camera, in a copy of the database; the finished model has the database's own
+cameras again, with equal parameters.
 """
 
 import sqlite3
@@ -18,7 +18,7 @@ from colmap_vg.scene.view_graph import ViewGraph
 
 
 def shared_cameras(graph: ViewGraph) -> list[list[int]]:
-    """Ids of cameras of one focal length, given or found in common; two or more each."""
+    """Groups of ids of two or more cameras with the same focal length."""
     if graph.camera_ids is None or graph.camera_focal_lengths is None:
         return []
     focals, group = np.unique(graph.camera_focal_lengths, return_inverse=True)
@@ -27,24 +27,24 @@ def shared_cameras(graph: ViewGraph) -> list[list[int]]:
 
 
 def merge_cameras(database_path: Path, groups: Sequence[Sequence[int]]) -> dict[int, int]:
-    """Let the images of each group of cameras use one of them, where model, size and parameters agree.
+    """Merge the cameras of each group that have the same model, size and parameters.
 
     Parameters
     ----------
     database_path : Path
-        A copy, of the current schema; it is changed.
+        A copy of a database, with the current schema; modified in place.
     groups : sequence of sequence of int
         Camera ids.
 
     Returns
     -------
     dict of int to int
-        For each camera that was replaced the one in its place.
+        For the id of each camera that was removed, the id of the camera that its images use now.
     """
     replaced: dict[int, int] = {}
     with closing(sqlite3.connect(database_path)) as connection, connection:
         rows = connection.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
-        # Databases of older schemas have no rigs, and pycolmap makes them when it loads one.
+        # Databases with older schemas have no rigs; pycolmap creates them on loading.
         rig_of = dict(connection.execute("SELECT ref_sensor_id, rig_id FROM rigs").fetchall())
         kind = {row[0]: (*row[1:], row[0] in rig_of) for row in rows}
         for ids in groups:
@@ -63,15 +63,15 @@ def merge_cameras(database_path: Path, groups: Sequence[Sequence[int]]) -> dict[
     return replaced
 
 
-def with_own_cameras(
+def with_database_cameras(
     cache: "pycolmap.DatabaseCache", model: "pycolmap.Reconstruction", replaced: dict[int, int]
 ) -> "pycolmap.Reconstruction":
-    """The model on the database's own cameras.
+    """Copy a model, with the database's own cameras in place of shared ones.
 
     Parameters
     ----------
     cache : pycolmap.DatabaseCache
-        Of the unchanged database.
+        Of the database, without merged cameras.
     model : pycolmap.Reconstruction
         With shared cameras.
     replaced : dict of int to int

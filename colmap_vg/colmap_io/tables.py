@@ -1,4 +1,4 @@
-"""The rows of a COLMAP database as arrays, read straight by sqlite; every damaged row is named."""
+"""Read the rows of a COLMAP database as arrays through sqlite, with errors that name damaged rows."""
 
 import sqlite3
 from collections import Counter
@@ -18,14 +18,15 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 UNDEFINED, DEGENERATE, CALIBRATED, UNCALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC, WATERMARK = range(8)
-"""COLMAP's configurations of pairs, as a database has them."""
+"""COLMAP's two-view configurations, as stored in a database."""
 MAX_SIZE_PX, MAX_COORDINATE_PX = 2**24, 1e7
-"""Pixels; larger images and coordinates are damage, and their products would leave the numbers' range."""
+"""Maximum image size and keypoint coordinate, pixels; larger ones are damage, and their products would overflow."""
 MIN_FOCAL_SHARE, MAX_FOCAL_SHARE = 1e-3, 1e6
-"""Focal length over image size, from the widest lens to the longest telescope and far beyond."""
+"""Minimum and maximum ratio of focal length to image size, well beyond those of any wide-angle lens or telescope."""
 MAX_PARAMETER = 1e9
+"""Maximum absolute value of a camera parameter, in COLMAP's units."""
 MAX_ID = 2**32 - 2
-"""COLMAP's ids are 32 bits wide, and the last one says "none"."""
+"""Maximum id: COLMAP's ids are unsigned 32-bit integers, of which the last means "none"."""
 
 MAX_NUM_IMAGES = 2_147_483_647
 """COLMAP's pair id is ``image_id1 * MAX_NUM_IMAGES + image_id2`` with ``image_id1 < image_id2``."""
@@ -33,7 +34,7 @@ MAX_NUM_IMAGES = 2_147_483_647
 
 @dataclass(frozen=True, eq=False)
 class DatabaseTables:
-    """Cameras, images and verified pairs of a database; images by id, pairs by pair id.
+    """Cameras, images and verified pairs of a database; images ordered by id, pairs by pair id.
 
     Attributes
     ----------
@@ -41,22 +42,23 @@ class DatabaseTables:
     image_ids : (n,) int64 array
     image_names : tuple of str
     camera_idx : (n,) int64 array
+        Row of each image's camera.
     keypoints : tuple of (k, 2) float32 array
-        Pixels, one array an image; empty for images without keypoints.
+        Pixels, one array per image; empty for images without keypoints.
     pairs : (m, 2) int64 array
         Rows of images.
     configs : (m,) int64 array
         COLMAP's two-view configurations.
     F, E, H : (m, 3, 3) array
-        NaN where the database holds none.
+        NaN where the database has none.
     rotations, translations : (m, 3, 3), (m, 3) array
-        Stored cam2_from_cam1; NaN where there is none.
+        Stored cam2_from_cam1; NaN where the database has none.
     offsets : (m + 1,) int64 array
         Inlier matches of pair k are rows ``offsets[k]:offsets[k + 1]`` of `matches`.
     matches : (k, 2) int64 array
         Keypoint indices in image 1 and image 2.
     caveats : tuple of str
-        What was left out to fit into memory.
+        Sentences on what was changed or left out on reading.
     """
 
     cameras: tuple["pycolmap.Camera", ...]
@@ -76,9 +78,10 @@ class DatabaseTables:
     caveats: tuple[str, ...] = ()
 
     def matched_keypoints(self, rows: IntArray, pairs: IntArray, offsets: IntArray, side: int) -> IntArray:
-        """Places (k,) of chosen rows of `matches` in image 1 (side 0) or 2 (side 1) among all images' keypoints.
+        """Indices (k,) of matched keypoints in the concatenation of all images' keypoints.
 
-        `pairs` are the pairs of the rows, `offsets` their segments in `rows`.
+        Those of `rows` of `matches`, in image 1 (side 0) or 2 (side 1); `pairs` are the pairs of the rows, `offsets`
+        their segments in `rows`.
         """
         starts = np.concatenate([[0], np.cumsum([len(k) for k in self.keypoints])])
         image = np.repeat(self.pairs[pairs, side], np.diff(offsets))
@@ -86,12 +89,12 @@ class DatabaseTables:
 
 
 def read_tables(database_path: str | PathLike[str]) -> DatabaseTables:
-    """All that mapping needs of a database, of the current or an older schema.
+    """Read the tables of a database that mapping needs, of the current or an older schema.
 
     Raises
     ------
     DatabaseError
-        The file is no readable COLMAP database, or a row is damaged; the message names it.
+        The file is not a readable COLMAP database, or a row is damaged; the message names it.
     """
     with reading(database_path) as connection:
         reader = _Reader(connection, str(database_path))
@@ -228,7 +231,7 @@ class _Reader:
         )
 
     def _cap(self) -> tuple[int, tuple[str, ...]]:
-        """Matches that each pair may keep to fit into memory, 0: all; and what to say of it."""
+        """Maximum number of matches per pair that fits into memory (0: all), and a warning about it."""
         query = "SELECT length(data) FROM two_view_geometries WHERE rows > 0 AND typeof(data) = 'blob'"
         numbers = np.array([size // 8 for (size,) in self._connection.execute(query)], dtype=np.int64)
         memory = available_memory()
@@ -237,12 +240,12 @@ class _Reader:
         if cap is None:
             needed = numbers.sum() * BYTES_PER_MATCH_IN_COLMAP / 2**30
             raise DatabaseError(
-                f"{self._path}: {total} of {len(numbers):,} pairs take {needed:.1f} GiB or more, and {free}: map parts"
+                f"{self._path}: {total} of {len(numbers):,} pairs need at least {needed:.1f} GiB, but {free}: map parts"
                 " of the images, match fewer pairs, or use a machine with more memory"
             )
         if cap == 0:
             return 0, ()
-        return cap, (f"{total} do not fit into memory ({free}): {cap} of each pair are used to solve, spread evenly.",)
+        return cap, (f"{total} do not fit into memory ({free}): poses are solved from {cap} of each pair at most.",)
 
     def _image_rows(self, pair_ids: IntArray, image_ids: IntArray) -> IntArray:
         pairs = np.stack([pair_ids // MAX_NUM_IMAGES, pair_ids % MAX_NUM_IMAGES], axis=1)
@@ -250,7 +253,7 @@ class _Reader:
             "it links an image to itself": pairs[:, 0] == pairs[:, 1],
             "it links an image that does not exist": ~np.isin(pairs, image_ids).all(axis=1),
             "its images are not in the order of their ids": pairs[:, 0] > pairs[:, 1],
-            "it stands there twice": np.diff(pair_ids, prepend=-1) == 0,
+            "it is stored twice": np.diff(pair_ids, prepend=-1) == 0,
         }
         for what, bad in faults.items():
             if bad.any():
@@ -284,7 +287,7 @@ class _Reader:
             values = self._values(blob, np.float64, where)
             if len(values) not in (0, size):
                 raise self._damaged(where, f"it holds {len(values)} values, expected {size}")
-            # COLMAP's matrices and poses are of ordinary size; others are as good as none, and would overflow.
+            # Matrices and poses with extreme values count as missing: COLMAP writes none, and they would overflow.
             if len(values) and 1e-50 < np.nan_to_num(np.abs(values).max(), nan=np.inf) < 1e50:
                 out[k] = values
         return out
@@ -293,18 +296,18 @@ class _Reader:
         if not isinstance(value, int) or not 0 <= value <= highest:
             raise self._damaged(where, f"its id is not between 0 and {highest}")
         if value in before:
-            raise self._damaged(where, "it stands there twice")
+            raise self._damaged(where, "it is stored twice")
 
     def _values(self, blob: object, kind: type, where: str, rows: object = None, cols: object = None) -> NDArray[Any]:
-        """Values of a blob, which may be missing; as rows and columns where the database tells these."""
+        """Values of a blob, which may be missing, in the given number of rows and columns if the table has these."""
         blob = b"" if blob is None else blob
         if not isinstance(blob, bytes) or len(blob) % np.dtype(kind).itemsize:
-            raise self._damaged(where, f"no whole values of {np.dtype(kind).itemsize} bytes are there")
+            raise self._damaged(where, f"the data are not whole values of {np.dtype(kind).itemsize} bytes")
         values: NDArray[Any] = np.frombuffer(blob, dtype=kind)
         if rows is None and cols is None:
             return values
         if not isinstance(rows, int) or not isinstance(cols, int) or min(rows, cols) < 0 or len(values) != rows * cols:
-            raise self._damaged(where, f"{len(values)} values are there for {rows} rows of {cols}")
+            raise self._damaged(where, f"it has {len(values)} values for {rows} rows of {cols}")
         return values.reshape(rows, cols)
 
     def _pair_name(self, pair_id: int) -> str:
@@ -315,7 +318,7 @@ class _Reader:
 
 
 def _rotations_from_wxyz(q: Array) -> Array:
-    """Rotation matrices of COLMAP's stored quaternions (w, x, y, z); NaN for none or zero ones."""
+    """Rotation matrices of COLMAP's stored quaternions (w, x, y, z); NaN for missing or zero ones."""
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
         usable = norm[:, 0] > 0

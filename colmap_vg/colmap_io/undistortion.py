@@ -1,4 +1,4 @@
-"""All keypoints of a database as pinhole cameras would see them."""
+"""Undistort all keypoints of a database."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,9 @@ BoolArray = NDArray[np.bool_]
 
 
 def undistorted_keypoints(tables: DatabaseTables) -> tuple[Array, BoolArray]:
-    """Keypoints of all images one after the other, undistorted by the database's calibrations.
+    """Undistort the keypoints of all images, concatenated, with the database's calibrations.
 
-    Fundamental matrices are those of pinhole cameras; what a lens bends would be taken for another focal length.
+    Fundamental matrices hold for pinhole cameras; distortion would bias the focal lengths estimated from them.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ def undistorted_keypoints(tables: DatabaseTables) -> tuple[Array, BoolArray]:
     Returns
     -------
     pixels : (k, 2) array
-        NaN where a lens has no ray.
+        NaN where `valid` is False.
     valid : (k,) bool array
         See `undistorted_pixels`.
     """

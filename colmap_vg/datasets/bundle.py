@@ -1,7 +1,7 @@
-"""Bundler's `bundle.out`, as the 1DSfM sets keep their truth in `gt_bundle.out`.
+"""Read Bundler's `bundle.out` format, which the 1DSfM data sets use for their ground truth (`gt_bundle.out`).
 
-A camera is ``f k1 k2``, a world-to-camera rotation and a translation ``t``; it looks along -z. In COLMAP's axes the
-rotation is ``F R`` with ``F = diag(1, -1, -1)``, and the centre is ``-R^T t``.
+A camera is ``f k1 k2``, a world-to-camera rotation and a translation ``t``, and looks along -z. With COLMAP's camera
+axes the rotation is ``F R``, where ``F = diag(1, -1, -1)``, and the centre is ``-R^T t``.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ _CAMERA_LINES = 5
 
 
 def read_bundle(path: str | Path) -> dict[int, tuple[Array, Array]]:
-    """Camera poses of a Bundler file, by camera index.
+    """Read the camera poses of a Bundler file.
 
     Parameters
     ----------
@@ -30,12 +30,12 @@ def read_bundle(path: str | Path) -> dict[int, tuple[Array, Array]]:
     Returns
     -------
     dict of int to (cam_from_world_rotation (3, 3), projection_center (3,))
-        Cameras with focal length 0 are unregistered and left out. COLMAP's camera axes.
+        By camera index, with COLMAP's camera axes. Cameras with focal length 0 are not registered and are skipped.
 
     Raises
     ------
     DataFileError
-        With file and line.
+        The file cannot be read or a line is bad; the message names file and line.
     """
     path = Path(path)
     lines = read_text(path).splitlines()
@@ -45,7 +45,7 @@ def read_bundle(path: str | Path) -> dict[int, tuple[Array, Array]]:
     counts = _numbers(path, lines, start, 2)
     num_cameras = int(counts[0])
     if num_cameras < 0 or num_cameras != counts[0]:
-        raise DataFileError(f"{path}:{start + 1}: {counts[0]} is no number of cameras")
+        raise DataFileError(f"{path}:{start + 1}: {counts[0]} is not a valid number of cameras")
     poses: dict[int, tuple[Array, Array]] = {}
     for camera in range(num_cameras):
         first = start + 1 + _CAMERA_LINES * camera
@@ -53,7 +53,7 @@ def read_bundle(path: str | Path) -> dict[int, tuple[Array, Array]]:
             continue
         R = np.stack([_numbers(path, lines, first + row, 3) for row in (1, 2, 3)])
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-            raise DataFileError(f"{path}:{first + 2}: camera {camera} holds no rotation matrix")
+            raise DataFileError(f"{path}:{first + 2}: the rotation of camera {camera} is not a rotation matrix")
         t = _numbers(path, lines, first + 4, 3)
         poses[camera] = (so3.project(BUNDLER_FROM_COLMAP_AXES @ R), -R.T @ t)
     return poses

@@ -1,9 +1,9 @@
-"""Pose graphs in g2o's text format (``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT``).
+"""Read pose graphs in g2o's text format (``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT``).
 
 A vertex is ``id x y z qx qy qz qw``, the pose of camera (or robot) in the world: its position, and its rotation from
 camera to world. An edge is ``i j x y z qx qy qz qw`` and the upper triangle of a 6 x 6 information matrix: camera j's
 pose in camera i's frame. g2o's error is ``T_ij^-1 T_i^-1 T_j``, translation first. As in GTSAM and SE-Sync, the
-rotation part of the information is taken to belong to the rotation vector.
+rotation part of the information is interpreted as that of the rotation vector.
 """
 
 from dataclasses import dataclass
@@ -30,10 +30,11 @@ class PoseGraph:
     Attributes
     ----------
     ids : (n,) int64 array
-        The file's vertex ids, in the file's order.
+        Vertex ids in the order of the file.
     cam_from_world_rotations : (n, 3, 3) array
-        The file's estimates.
+        Initial rotations in the file.
     projection_centers : (n, 3) array
+        Initial positions in the file, world frame.
     edges : (m, 2) int64 array
         Rows into `ids`.
     cam2_from_cam1_rotations : (m, 3, 3) array
@@ -52,7 +53,7 @@ class PoseGraph:
     information: Array
 
     def chordal_weights(self) -> tuple[Array, Array]:
-        """Scalar weights of both terms: ``kappa = 3 / (2 tr Sigma_R)``, ``tau = 3 / tr Sigma_t``, (m,) each.
+        """Scalar weights of rotations and translations: ``3 / (2 tr Sigma_R)``, ``3 / tr Sigma_t``, (m,) each.
 
         The maximum-likelihood weights of the isotropic noise nearest to the edge's (Rosen et al., SE-Sync, 2019).
         """
@@ -82,7 +83,7 @@ def read_g2o(path: str | PathLike[str]) -> PoseGraph:
     lines: dict[str, list[int]] = {_VERTEX: [], _EDGE: []}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
-        if not words or words[0] == "FIX":  # the gauge is the solver's business
+        if not words or words[0] == "FIX":  # the solver fixes the gauge
             continue
         values.get(words[0], []).append(_numbers(path, number, words))
         lines[words[0]].append(number)
@@ -94,7 +95,7 @@ def read_g2o(path: str | PathLike[str]) -> PoseGraph:
     again = np.flatnonzero(np.diff(ids[order]) == 0)
     if len(again):
         row = int(order[again[0] + 1])
-        raise DataFileError(f"{path}:{lines[_VERTEX][row]}: vertex {ids[row]} is there twice")
+        raise DataFileError(f"{path}:{lines[_VERTEX][row]}: vertex {ids[row]} is listed twice")
     rows = _vertex_rows(path, lines[_EDGE], ids, order, edges[:, :2])
     world_from_cam = _rotations(path, lines[_VERTEX], vertices[:, 4:8])
     cam1_from_cam2 = _rotations(path, lines[_EDGE], edges[:, 5:9])
@@ -112,7 +113,7 @@ def read_g2o(path: str | PathLike[str]) -> PoseGraph:
 
 def _numbers(path: Path, number: int, words: list[str]) -> list[float]:
     if words[0] not in _NUM_VALUES:
-        raise DataFileError(f"{path}:{number}: {words[0]} is not known; 3-D pose graphs have {_VERTEX} and {_EDGE}")
+        raise DataFileError(f"{path}:{number}: {words[0]} is unknown; 3-D pose graphs have {_VERTEX} and {_EDGE}")
     if len(words) - 1 != _NUM_VALUES[words[0]]:
         raise DataFileError(f"{path}:{number}: {words[0]} needs {_NUM_VALUES[words[0]]} values, found {len(words) - 1}")
     try:
@@ -128,14 +129,14 @@ def _identifiers(path: Path, lines: list[int], values: Array) -> NDArray[np.int6
     broken = np.flatnonzero((values != np.round(values)) | (values < 0) | (values > 2**53))
     if len(broken):
         row = int(broken[0])
-        raise DataFileError(f"{path}:{lines[row]}: {values[row]} is no vertex id")
+        raise DataFileError(f"{path}:{lines[row]}: {values[row]} is not a vertex id")
     return values.astype(np.int64)
 
 
 def _vertex_rows(
     path: Path, lines: list[int], ids: NDArray[np.int64], order: NDArray[np.int64], ends: Array
 ) -> NDArray[np.int64]:
-    """Rows of the edges' ends."""
+    """Rows (m, 2) of the edges' vertices, from their ids."""
     wanted = np.stack([_identifiers(path, lines, ends[:, k]) for k in range(2)], axis=1)
     place = np.minimum(np.searchsorted(ids[order], wanted), len(ids) - 1)
     rows = order[place]
@@ -158,7 +159,7 @@ def _rotations(path: Path, lines: list[int], quaternions: Array) -> Array:
 
 
 def _information(upper: Array, cam2_from_cam1: Array) -> Array:
-    """From g2o's error ``(R_ij s, -w)`` to ours ``(w, s)``, (m, 6, 6)."""
+    """Convert information matrices from g2o's error ``(R_ij s, -w)`` to ours ``(w, s)``, (m, 6, 6)."""
     m, (rows, cols) = len(upper), np.triu_indices(6)
     given = np.zeros((m, 6, 6))
     given[:, rows, cols] = upper

@@ -1,7 +1,7 @@
-"""MATLAB files of Arrigoni et al.: adjacency matrices of the 1DSfM sets, and relative rotations with truth.
+"""Read the MATLAB files of Arrigoni et al.: adjacency matrices of the 1DSfM sets, and relative and true rotations.
 
-`RR` of a rotation file holds ``R_j R_i^T`` in slice k for the 1-based pair ``I[:, k] = (i, j)``, in our order (1DSfM's
-`EGs.txt` holds the transpose). `Rgt` holds world-to-camera rotations, all zero where the truth is unknown.
+`RR` of a rotation file is ``R_j R_i^T`` in slice k for the 1-based pair ``I[:, k] = (i, j)``, in our order (1DSfM's
+`EGs.txt` has the transpose). `Rgt` has world-to-camera rotations, all zero where the true rotation is unknown.
 """
 
 from dataclasses import dataclass
@@ -23,17 +23,18 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RotationGraph:
-    """Relative rotations, and absolute ones where they are known.
+    """Relative rotations, and true absolute ones where they are known.
 
     Attributes
     ----------
     num_images : int
     edges : (m, 2) int64 array
-        Rows, counted from 0.
+        Rows of images, 0-based.
     cam2_from_cam1_rotations : (m, 3, 3) array
     cam_from_world_rotations : (n, 3, 3) array
-        Truth; NaN where it is unknown.
+        True rotations; NaN where they are unknown.
     known : (n,) bool array
+        Whether the true rotation is known.
     """
 
     num_images: int
@@ -44,12 +45,12 @@ class RotationGraph:
 
 
 def read_rotation_mat(path: str | Path) -> RotationGraph:
-    """Relative rotations of a `.mat` file with `I`, `RR` and, when present, `Rgt`.
+    """Read the rotations of a `.mat` file with variables `I`, `RR` and optionally `Rgt`.
 
     Raises
     ------
     DataFileError
-        The file is no MATLAB file, lacks a variable, or its values are out of range.
+        The file is not a MATLAB file, lacks a variable, or its values are out of range.
     """
     content = _load(path, ("I", "RR"))
     pairs = np.asarray(content["I"], dtype=np.int64).T - 1
@@ -69,19 +70,19 @@ def read_rotation_mat(path: str | Path) -> RotationGraph:
         truth = np.full((num_images, 3, 3), np.nan)
         truth[known] = so3.project(given[known])
     if len(pairs) and (pairs.min() < 0 or (pairs[:, 0] == pairs[:, 1]).any()):
-        raise DataFileError(f"{path}: I holds an index below 1 or links an image to itself")
+        raise DataFileError(f"{path}: I contains an index below 1 or links an image to itself")
     if not np.isfinite(relative).all():
-        raise DataFileError(f"{path}: RR holds NaN or infinite values")
+        raise DataFileError(f"{path}: RR contains NaN or infinite values")
     return RotationGraph(num_images, pairs, so3.project(relative), truth, known)
 
 
 def read_topology_mat(path: str | Path) -> tuple[int, IntArray]:
-    """Number of images and edges (m, 2), i < j, of the sparse adjacency matrix `A` of a `.mat` file.
+    """Read the number of images and the edges (m, 2), i < j, from the sparse adjacency matrix `A` of a `.mat` file.
 
     Raises
     ------
     DataFileError
-        The file is no MATLAB file or holds no square matrix `A`.
+        The file is not a MATLAB file or has no square matrix `A`.
     """
     A = sp.coo_array(_load(path, ("A",))["A"])
     if A.ndim != 2 or A.shape[0] != A.shape[1]:
@@ -98,5 +99,5 @@ def _load(path: str | Path, names: tuple[str, ...]) -> dict[str, Any]:
         raise DataFileError(f"{path}: cannot be read as a MATLAB file ({error})") from error
     for name in names:
         if name not in content:
-            raise DataFileError(f"{path}: holds no variable {name}")
+            raise DataFileError(f"{path}: has no variable {name}")
     return content

@@ -1,4 +1,4 @@
-"""Folders of the 1DSfM data (Wilson & Snavely, ECCV 2014): `EGs.txt`, `cc.txt`, `list.txt`, `coords.txt`.
+"""Read folders of the 1DSfM data sets (Wilson & Snavely, ECCV 2014): `EGs.txt`, `cc.txt`, `list.txt`, `coords.txt`.
 
 A row of `EGs.txt` is ``i j R_ij (9, row-major) t_ij (3)`` with ``R_ij = R_i R_j^T`` for world-to-camera rotations and
 ``t_ij`` the position of camera j in camera i's frame. Its cameras look along -z with y up; with
@@ -17,22 +17,22 @@ from colmap_vg.geometry import so3
 from colmap_vg.scene.view_graph import ViewGraph
 
 BUNDLER_FROM_COLMAP_AXES = np.diag([1.0, -1.0, -1.0])
-"""Bundler's camera axes from COLMAP's: y and z change sign. Its own inverse."""
+"""Transformation from COLMAP's to Bundler's camera axes: y and z change sign. It is its own inverse."""
 
 
 def read_1dsfm(folder: str | Path) -> ViewGraph:
-    """Viewing graph of a 1DSfM folder, with all images of `cc.txt` (the largest connected component) when it is there.
+    """Read the viewing graph of a 1DSfM folder, restricted to the images of `cc.txt` (largest component) if it exists.
 
     Parameters
     ----------
     folder : path
-        Holds `EGs.txt`; `cc.txt` (image indices of the component), `list.txt` (names) and `coords.txt` (feature
-        counts, not needed) may be missing.
+        Contains `EGs.txt`; `cc.txt` (image indices of the component), `list.txt` (names) and `coords.txt` (feature
+        counts, not used) are optional.
 
     Returns
     -------
     ViewGraph
-        `image_ids` are the set's own image indices, counted from 0 as in `list.txt`, in rising order.
+        `image_ids` are the data set's image indices, 0-based as in `list.txt`, in ascending order.
 
     Raises
     ------
@@ -46,9 +46,9 @@ def read_1dsfm(folder: str | Path) -> ViewGraph:
     relative = rows[:, 2:11].reshape(-1, 3, 3)
     _refuse(edge_file, pairs[:, 0] == pairs[:, 1], "links an image to itself")
     skewed = np.abs(relative @ np.swapaxes(relative, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-3
-    _refuse(edge_file, skewed | (np.linalg.det(relative) < 0), "holds no rotation matrix")
+    _refuse(edge_file, skewed | (np.linalg.det(relative) < 0), "contains no rotation matrix")
     length = np.linalg.norm(rows[:, 11:], axis=1)
-    _refuse(edge_file, length < 1e-9, "holds a zero translation")
+    _refuse(edge_file, length < 1e-9, "contains a zero translation")
 
     images = np.unique(pairs)
     if (folder / "cc.txt").exists():
@@ -66,7 +66,7 @@ def read_1dsfm(folder: str | Path) -> ViewGraph:
 
 
 def _names(path: Path, images: NDArray[np.int64]) -> tuple[str, ...]:
-    """Names of images from `list.txt` (name, then optional focal columns), () without the file."""
+    """Read the names of images from `list.txt` (name, then optional focal length columns); () without the file."""
     if not path.exists():
         return ()
     names = [line.split()[0] for line in read_text(path).splitlines() if line.strip()]
@@ -82,7 +82,7 @@ def _indices(path: Path, values: NDArray[np.float64], meaning: str) -> NDArray[n
 
 
 def _refuse(path: Path, bad: NDArray[np.bool_], what: str) -> None:
-    """Raise for the first bad row, with its line in the file."""
+    """Raise an error that names the line of the first bad row."""
     rows = np.flatnonzero(bad)
     if len(rows):
         text = read_text(path).splitlines()

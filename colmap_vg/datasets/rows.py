@@ -1,4 +1,4 @@
-"""Rows of numbers in text files, with file and line in every complaint."""
+"""Read rows of numbers from text files, with file and line in all error messages."""
 
 from pathlib import Path
 
@@ -9,12 +9,12 @@ from colmap_vg.errors import DataFileError
 
 
 def read_text(path: Path) -> str:
-    """Text of a file.
+    """Read the text of a file.
 
     Raises
     ------
     DataFileError
-        The file is missing, a folder, not readable or not text.
+        The file is missing, is a folder, cannot be read or is not a text file.
     """
     try:
         return path.read_text()
@@ -24,14 +24,16 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path, num_columns: int, meaning: str) -> NDArray[np.float64]:
-    """Numbers of a file with the same number of columns on every line; empty lines and ``#`` comments are passed over.
+    """Read the numbers of a file with the same number of columns on every line.
+
+    Empty lines and ``#`` comments are skipped.
 
     Parameters
     ----------
     path : Path
     num_columns : int
     meaning : str
-        What a row holds, for the error message.
+        Description of a row for the error message.
 
     Returns
     -------
@@ -40,7 +42,7 @@ def read_rows(path: Path, num_columns: int, meaning: str) -> NDArray[np.float64]
     Raises
     ------
     DataFileError
-        With the line of the first bad row.
+        The file cannot be read or a row is bad; the message names the line of the first bad one.
     """
     lines = [line.split("#", 1)[0].split() for line in read_text(path).splitlines()]
     rows: list[list[float]] = []

@@ -1,4 +1,4 @@
-"""The demo: photographs rendered from known cameras, reconstructed with nothing else known, compared with the truth."""
+"""Demo: render photographs with known cameras, reconstruct them from the images alone, and compare with the truth."""
 
 import json
 import shutil
@@ -25,21 +25,21 @@ __all__ = ["DemoResult", "render_photographs", "run_demo"]
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The model held against the cameras that the photographs were rendered from, after the best similarity.
+    """Errors of a model's cameras with respect to the true ones, after the best similarity.
 
     Attributes
     ----------
     num_images, num_registered : int
     ring_radius_m : float
-        Metres, of the circle around which the cameras stand.
+        Mean radius of the ring of cameras, metres.
     mean_position_error_m, max_position_error_m : float
-        Metres, over registered images.
+        Over registered images, metres.
     mean_position_error_share : float
-        Of the ring's radius.
+        Mean position error as a share of the ring's radius.
     mean_rotation_error_deg : float
-        Degrees.
+        Over registered images, degrees.
     focal_error_share : float
-        Median found over true focal length, less 1.
+        Relative error of the median focal length, dimensionless.
     """
 
     num_images: int
@@ -53,12 +53,12 @@ class DemoResult:
 
     @property
     def summary(self) -> str:
-        """The comparison in a sentence."""
+        """One sentence on the errors."""
         return (
-            f"{self.num_registered} of {self.num_images} images registered; against the true cameras: mean position"
-            f" error {1e3 * self.mean_position_error_m:.1f} mm ({self.mean_position_error_share:.3%} of the ring's"
-            f" radius), mean rotation error {self.mean_rotation_error_deg:.3f} deg,"
-            f" focal length {self.focal_error_share:+.2%}"
+            f"{self.num_registered} of {self.num_images} images registered; compared with the true cameras: mean"
+            f" position error {1e3 * self.mean_position_error_m:.1f} mm ({self.mean_position_error_share:.3%} of the"
+            f" ring's radius), mean rotation error {self.mean_rotation_error_deg:.3f} deg, focal length error"
+            f" {self.focal_error_share:+.2%}"
         )
 
 
@@ -77,19 +77,19 @@ def run_demo(
     Parameters
     ----------
     output_path : path
-        Receives ``images``, ``truth.txt``, ``database.db`` and the model ``0``.
+        Folder for ``images``, ``truth.txt``, ``database.db`` and the model ``0``.
     num_images : int
         At least 3.
     seed : int
-        Of the scene, the cameras, the noise, and the reconstruction.
+        Random seed of the scene, the cameras, the noise and the reconstruction.
     num_threads : int
         -1: all cores.
     overwrite : bool
-        Replace what an earlier demo left in the output.
+        Replace the files of an earlier demo in the output folder.
     resume : bool
-        Reuse the photographs and the database of an interrupted demo of the same number of images and seed.
+        Reuse the photographs and the database of an interrupted demo with the same number of images and seed.
     on_event : callable, optional
-        Called with a `StageEvent` whenever a stage starts, gets on, ends, or has something to warn of.
+        Called with a `StageEvent` whenever a stage starts, progresses, ends or warns.
 
     Returns
     -------
@@ -98,12 +98,12 @@ def run_demo(
     Raises
     ------
     OptionError
-        Too few images.
+        There are too few images.
     ColmapVgError
-        As for `image_folder_mapping`; and where open3d cannot be loaded.
+        As for `image_folder_mapping`; also if open3d cannot be loaded.
     """
     if num_images < 3:
-        raise OptionError(f"num_images is {num_images}: a model needs 3 images or more")
+        raise OptionError(f"num_images is {num_images}: a model needs at least 3 images")
     output, log = Path(output_path), StageLog(on_event)
     image_path = output / "images"
     with output_lock(output):
@@ -118,7 +118,7 @@ def run_demo(
 def _photographs(
     output: Path, num_images: int, seed: int, log: StageLog, *, overwrite: bool, resume: bool
 ) -> TrueCameras:
-    """The photographs in ``output/images``, rendered or, to go on with, as they are; they appear all or none."""
+    """Render the photographs to ``output/images`` atomically, or reuse them on resume; return their cameras."""
     image_path = output / "images"
     with work_folder(output, overwrite) as work:
         record, made = work / "photographs.json", json.dumps({"num_images": num_images, "seed": seed})
@@ -150,7 +150,7 @@ def _photographs(
 
 
 def compared(model: "pycolmap.Reconstruction", cameras: TrueCameras) -> DemoResult:
-    """Errors of a model's cameras after the similarity that best maps their positions on the true ones."""
+    """Compute the errors of a model's cameras after the similarity that best maps their positions to the true ones."""
     row_of = {name: row for row, name in enumerate(cameras.names)}
     images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
     rows = [row_of[image.name] for image in images]

@@ -1,4 +1,4 @@
-"""The few EXIF fields that tell a focal length, written into a JPEG as cameras do."""
+"""Write the EXIF fields of the camera and its focal length into a JPEG file, as cameras do."""
 
 import struct
 
@@ -8,18 +8,18 @@ _START_OF_IMAGE = b"\xff\xd8"
 
 
 def with_focal_length(jpeg: bytes, make: str, model: str, focal_mm: float, focal_35mm: int) -> bytes:
-    """A JPEG with an APP1 segment that names the camera and its focal length (Exif 2.3, CIPA DC-008).
+    """Add an APP1 segment with the camera's name and focal length to a JPEG file (Exif 2.3, CIPA DC-008).
 
     Parameters
     ----------
     jpeg : bytes
-        Without EXIF.
+        File without EXIF data.
     make, model : str
-        ASCII.
+        Name of the camera, ASCII.
     focal_mm : float
-        Millimetres, kept to a hundredth.
+        Focal length, millimetres, stored to a hundredth.
     focal_35mm : int
-        Millimetres on film of 36 x 24 mm.
+        Focal length that is equivalent on film of 36 x 24 mm, millimetres.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A folder of rendered photographs, and the cameras that they were taken with."""
+"""Render a folder of photographs, and keep their true cameras."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ from colmap_vg.simulation.ring_scenes import look_at
 Array = NDArray[np.float64]
 
 RING_RADIUS = 4.0
-"""Metres, of the circle around which the cameras stand."""
-_WIDTH, _HEIGHT = 800, 600
-_FOCAL_35MM = 40.3  # millimetres; EXIF holds whole ones
-_RADIAL = -0.06
-_MAX_STEP = np.radians(20.0)
+"""Mean radius of the ring of cameras, metres."""
+_WIDTH, _HEIGHT = 800, 600  # pixels
+_FOCAL_35MM = 40.3  # millimetres; EXIF stores integers
+_RADIAL = -0.06  # COLMAP's radial term, dimensionless
+_MAX_STEP = np.radians(20.0)  # radians between neighbours
 
 
 @dataclass(frozen=True, eq=False)
 class TrueCameras:
-    """What the photographs were taken with.
+    """Poses and calibration of the rendered photographs.
 
     Attributes
     ----------
@@ -35,8 +35,9 @@ class TrueCameras:
     rotations : (n, 3, 3) array
         cam_from_world.
     centers : (n, 3) array
-        Projection centres, metres.
+        Projection centres, world frame, metres.
     camera : pycolmap.Camera
+        The calibration of all photographs.
     """
 
     names: tuple[str, ...]
@@ -46,16 +47,16 @@ class TrueCameras:
 
 
 def true_camera() -> "pycolmap.Camera":
-    """The camera of the demo: 800 x 600 pixels, a radial term, a principal point off the middle."""
-    focal = _FOCAL_35MM / 35.0 * max(_WIDTH, _HEIGHT)  # COLMAP's reading of the EXIF field
+    """Camera of the demo: 800 x 600 pixels, with a radial term and a principal point off the image centre."""
+    focal = _FOCAL_35MM / 35.0 * max(_WIDTH, _HEIGHT)  # as COLMAP interprets the EXIF field
     params = [focal, _WIDTH / 2 + 1.5, _HEIGHT / 2 - 1.0, _RADIAL]
     return pycolmap.Camera(model="SIMPLE_RADIAL", width=_WIDTH, height=_HEIGHT, params=params)
 
 
 def camera_ring(num_images: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Cameras by hand around the scene: cam_from_world rotations (n, 3, 3) and centres (n, 3).
+    """Cameras on a ring around the scene with jitter: cam_from_world rotations (n, 3, 3) and centres (n, 3), metres.
 
-    Few images stand on part of the ring, so that neighbours can be matched.
+    Few cameras cover only part of the ring, so that neighbours can be matched.
     """
     step = min(2 * np.pi / num_images, _MAX_STEP)
     angle = step * (np.arange(num_images) + rng.uniform(-0.15, 0.15, num_images))
@@ -73,7 +74,7 @@ def render_photographs(
     seed: int = 0,
     on_image: Callable[[int], None] | None = None,
 ) -> TrueCameras:
-    """Render a scene into JPEG files with EXIF.
+    """Render a scene to JPEG files with EXIF data.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def render_photographs(
         An existing folder.
     num_images : int
     seed : int
-        Of the scene, the cameras and the noise.
+        Random seed of the scene, the cameras and the noise.
     on_image : callable, optional
         Called with the number of photographs that are done.
 
@@ -106,14 +107,14 @@ def render_photographs(
 
 
 def true_cameras(num_images: int, seed: int) -> TrueCameras:
-    """The cameras of :func:`render_photographs`, without their photographs."""
+    """Make the cameras of :func:`render_photographs` without rendering."""
     _, ring_rng, *_ = np.random.default_rng(seed).spawn(2 + num_images)
     rotations, centers = camera_ring(num_images, ring_rng)
     return TrueCameras(tuple(f"{k:04d}.jpg" for k in range(num_images)), rotations, centers, true_camera())
 
 
 def write_truth(path: Path, cameras: TrueCameras) -> None:
-    """Write a line for each image: name, cam_from_world quaternion (x y z w) and translation, projection centre."""
+    """Write one line per image: name, cam_from_world quaternion (x y z w) and translation, projection centre."""
     lines = [
         "# name  qx qy qz qw  tx ty tz (cam_from_world)  cx cy cz (projection centre, metres)",
         f"# camera {cameras.camera.model_name} {cameras.camera.width} {cameras.camera.height} "

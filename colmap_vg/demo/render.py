@@ -1,4 +1,4 @@
-"""Photographs of a scene by ray casting on the CPU: lens distortion, sun, vignetting, exposure, noise."""
+"""Render photographs by ray casting on the CPU, with lens distortion, sunlight, vignetting, exposure and noise."""
 
 import ctypes
 from types import ModuleType
@@ -13,16 +13,16 @@ from colmap_vg.errors import ColmapVgError
 
 Array = NDArray[np.float64]
 
-SAMPLES = 2  # rays per pixel, each way
-_SUN = np.array([0.45, -0.35, 0.82])
-_SKY = np.array([186.0, 203.0, 226.0], dtype=np.float32)  # RGB
-_AMBIENT = 0.45
-_VIGNETTING = 0.35  # of the light is lost at a unit of tangent squared
-_READ_NOISE, _SHOT_NOISE = 1.2, 0.05  # grey values; variance per grey value
+SAMPLES = 2  # rays per pixel in each direction
+_SUN = np.array([0.45, -0.35, 0.82])  # direction to the sun, world frame
+_SKY = np.array([186.0, 203.0, 226.0], dtype=np.float32)  # RGB, 0 to 255
+_AMBIENT = 0.45  # share of ambient light
+_VIGNETTING = 0.35  # share of the light lost per squared tangent of the angle to the optical axis
+_READ_NOISE, _SHOT_NOISE = 1.2, 0.05  # standard deviation, grey values; variance per grey value
 
 
 class RayCaster:
-    """Casts rays into a textured scene.
+    """Ray caster for a textured scene.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class RayCaster:
         self._shades = _AMBIENT + (1.0 - _AMBIENT) * np.clip(textured.scene.normals() @ _SUN, 0.0, None)
 
     def colors(self, origin: Array, directions: Array) -> NDArray[np.float32]:
-        """Light along rays from one point: (h, w, 3) directions to (h, w, 3) RGB, 0 to 255."""
+        """Colours (h, w, 3), RGB, 0 to 255, seen along rays (h, w, 3) from one point."""
         import cv2
 
         quad, depth = self.hits(origin, directions)
@@ -63,7 +63,7 @@ class RayCaster:
         return np.where(seen[..., None], lit, _SKY).astype(np.float32)
 
     def hits(self, origin: Array, directions: Array) -> tuple[NDArray[np.int64], Array]:
-        """Face (-1: sky) and distance in lengths of the direction for each ray: (h, w), (h, w)."""
+        """Face (h, w) that each ray hits (-1: sky), and its distance (h, w) in units of the direction's length."""
         rays = np.empty((*directions.shape[:2], 6), dtype=np.float32)
         rays[..., :3], rays[..., 3:] = origin, directions
         found = self._scene.cast_rays(self._o3d.core.Tensor(rays))
@@ -75,18 +75,19 @@ class RayCaster:
 def photograph(
     caster: RayCaster, in_camera: Array, rotation: Array, center: Array, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """One photograph as a camera would store it.
+    """Render one photograph.
 
     Parameters
     ----------
     caster : RayCaster
     in_camera : (SAMPLES h, SAMPLES w, 3) array
-        Rays of the camera's pixels, from `pixel_rays`.
+        Rays of the camera's pixels, camera frame, from `pixel_rays`.
     rotation : (3, 3) array
         cam_from_world.
     center : (3,) array
+        Projection centre, world frame, metres.
     rng : numpy.random.Generator
-        For exposure and noise.
+        Generator of exposure and noise.
 
     Returns
     -------
@@ -103,7 +104,7 @@ def photograph(
 
 
 def pixel_rays(camera: "pycolmap.Camera", samples: int = SAMPLES) -> Array:
-    """Rays ``(x, y, 1)`` in the camera through a grid of samples in each pixel, (samples h, samples w, 3)."""
+    """Rays ``(x, y, 1)`` through a grid of samples in each pixel, camera frame, (samples h, samples w, 3)."""
     x = (np.arange(samples * camera.width) + 0.5) / samples
     y = (np.arange(samples * camera.height) + 0.5) / samples
     grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
@@ -113,7 +114,7 @@ def pixel_rays(camera: "pycolmap.Camera", samples: int = SAMPLES) -> Array:
 
 
 def load_open3d() -> ModuleType:
-    """open3d, with libusb from its wheel: open3d needs it, and a bare machine has none.
+    """Import open3d, after loading the libusb of a Python package, since some machines lack the library.
 
     Raises
     ------

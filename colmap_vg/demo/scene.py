@@ -1,4 +1,4 @@
-"""A ruined courtyard of planar faces: ground, broken walls, columns, an arch, rubble; every seed builds another."""
+"""Random scene of a ruined courtyard made of planar faces: ground, broken walls, columns, an arch and rubble."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ _GROUND, _BRICK, _STONE, _PLASTER = range(4)
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Planar quadrilaterals, in metres, z up.
+    """A scene of planar quadrilaterals with materials.
 
     Attributes
     ----------
     quads : (q, 4, 3) array
-        Corners, counter-clockwise as seen from outside.
+        Corners, world frame with z up, metres; counter-clockwise as seen from outside.
     materials : (q,) int64 array
-        Ground, brick, stone or plaster: rows of the textures' materials.
+        0: ground, 1: brick, 2: stone, 3: plaster.
     """
 
     quads: Array
@@ -33,7 +33,7 @@ class Scene:
 
 
 def build_ruin(rng: np.random.Generator) -> Scene:
-    """A scene of about four metres across, drawn from the generator."""
+    """Build a random scene with a diameter of about four metres."""
     parts = [(_ground(), _GROUND), *_walls(rng), *_columns(rng), *_arch(rng), *_rubble(rng)]
     quads = np.concatenate([quads for quads, _ in parts])
     materials = np.concatenate([np.full(len(quads), material) for quads, material in parts])
@@ -46,7 +46,7 @@ def _ground() -> Array:
 
 
 def _walls(rng: np.random.Generator) -> list[tuple[Array, int]]:
-    """Two walls at an angle, each of blocks of broken height."""
+    """Two walls at an angle, each of blocks of random height."""
     parts = []
     for start, along, material in (((-1.5, -0.9), (1.0, 0.12), _BRICK), ((-1.35, -0.65), (-0.1, 1.0), _STONE)):
         direction = np.array(along) / np.hypot(*along)
@@ -70,7 +70,7 @@ def _columns(rng: np.random.Generator) -> list[tuple[Array, int]]:
 
 
 def _arch(rng: np.random.Generator) -> list[tuple[Array, int]]:
-    """Two pillars and the wedge stones over them."""
+    """Two pillars and the arch of stones above them."""
     yaw, radius = rng.uniform(-0.3, 0.3), 0.4
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     middle = np.array([0.1, -0.15, 0.0])
@@ -99,7 +99,7 @@ def _rubble(rng: np.random.Generator) -> list[tuple[Array, int]]:
 
 
 def _box(center: tuple[float, ...], size: tuple[float, ...], yaw: float) -> Array:
-    """Six faces of a box that is turned about the vertical axis, (6, 4, 3)."""
+    """Faces of a box that is rotated about the vertical axis, (6, 4, 3)."""
     corner = np.array(
         [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
     )
@@ -109,7 +109,7 @@ def _box(center: tuple[float, ...], size: tuple[float, ...], yaw: float) -> Arra
 
 
 def _prism(foot: tuple[float, ...], radius: float, height: float, num_sides: int) -> Array:
-    """Sides and top of an upright prism with an even number of sides."""
+    """Faces of the sides and the top of an upright prism with an even number of sides, (q, 4, 3)."""
     angle = 2 * np.pi * np.arange(num_sides) / num_sides
     low = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(num_sides)], axis=1) + np.array(foot)
     high = low + np.array([0.0, 0.0, height])

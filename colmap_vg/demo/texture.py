@@ -1,4 +1,4 @@
-"""One texture image for all faces of a scene, each with a part of its own: octaves of noise, mortar, stains."""
+"""Paint the texture image of a scene, with a separate region per face: octaves of noise, mortar and stains."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ Array = NDArray[np.float64]
 _WIDTH = 4096  # texels
 _MARGIN = 2  # texels between faces
 _COLORS = np.array([[112, 118, 96], [128, 84, 66], [138, 134, 124], [176, 164, 142]], dtype=np.float32)  # RGB
-_CONTRASTS = np.array([34.0, 26.0, 30.0, 22.0], dtype=np.float32)
+_CONTRASTS = np.array([34.0, 26.0, 30.0, 22.0], dtype=np.float32)  # grey values, per material
 _BRICK = 1
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedScene:
-    """A scene with its texture.
+    """A scene with its texture image and the mapping from faces to it.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class TexturedScene:
     origins : (q, 2) array
         Texel of each face's first corner.
     axes : (q, 2, 3) array
-        A point x of face q has texel ``origins[q] + axes[q] @ (x - quads[q, 0])``.
+        A point x of face q has texel ``origins[q] + axes[q] @ (x - quads[q, 0])``; texels per metre.
     """
 
     scene: Scene
@@ -38,7 +38,7 @@ class TexturedScene:
 
 
 def paint(scene: Scene, rng: np.random.Generator, texels_per_metre: float = 300.0) -> TexturedScene:
-    """Lay the faces out side by side and paint them."""
+    """Pack the faces of a scene into a texture image and paint them."""
     quads, normals = scene.quads, scene.normals()
     along = quads[:, 1] - quads[:, 0]
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -52,7 +52,7 @@ def paint(scene: Scene, rng: np.random.Generator, texels_per_metre: float = 300.
 
 
 def _packed(sizes: NDArray[np.int_]) -> tuple[NDArray[np.int_], int]:
-    """Corners (q, 2) of rectangles on shelves of one width, tallest first, and the height of it all."""
+    """Pack rectangles on shelves of one width, tallest first: their corners (q, 2) and the total height, texels."""
     places = np.zeros_like(sizes)
     x = y = shelf = 0
     for k in np.argsort(-sizes[:, 1], kind="stable"):
@@ -80,7 +80,7 @@ def _painted(
 
 
 def _octaves(height: int, wavelengths: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Noise of unit deviation over the whole texture, equal parts of each wavelength in texels."""
+    """Noise of unit standard deviation over the whole texture, with equal parts of each wavelength (texels)."""
     import cv2
 
     total = np.zeros((height, _WIDTH), dtype=np.float32)
@@ -92,7 +92,7 @@ def _octaves(height: int, wavelengths: tuple[int, ...], rng: np.random.Generator
 
 
 def _mortar(height: int, width: int) -> NDArray[np.bool_]:
-    """Joints of a running bond: courses of 28 texels, bricks of 80."""
+    """Mask (h, w) of the mortar joints of a running bond: courses of 28 texels, bricks of 80."""
     row, column = np.mgrid[:height, :width]
     shifted = column + 40 * (row // 28 % 2)
     return np.asarray((row % 28 < 3) | (shifted % 80 < 3))

@@ -1,7 +1,7 @@
-"""The structure of JPEG and PNG files.
+"""Check the structure of JPEG and PNG files before feature extraction.
 
-COLMAP decodes what it can of a damaged file and goes on: half of a truncated JPEG becomes a grey half image with wrong
-features, without a word. So the structure is checked before anything is extracted.
+COLMAP decodes what it can of a damaged file without a warning: a JPEG file truncated in the middle becomes an image
+whose lower half is grey, with wrong features.
 """
 
 import re
@@ -14,20 +14,20 @@ _STANDALONE = frozenset([0x01, *range(0xD0, 0xD8)])
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _AFTER_SCAN_DATA = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
 _TAIL_BYTES, _LAST_COLUMNS = 64, 8
-"""Without the last bytes of its data a JPEG image changes in its last block, if the data reach so far."""
+"""Number of last bytes to cut off a JPEG file, and number of last columns that then change if the data are complete."""
 
 
 class DamagedFileError(Exception):
-    """The file's structure is broken; the message is the reason for the user."""
+    """The structure of a file is damaged; the message is shown to the user as the reason."""
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height from the frame header, after a walk through the markers of a JPEG file (ITU-T T.81, annex B).
+    """Check all markers of a JPEG file (ITU-T T.81, annex B), and return the width and height of its frame header.
 
     Raises
     ------
     DamagedFileError
-        A marker is missing where one must be, or the data end before the image does.
+        A marker is missing, or the data end before the image does.
     """
     size, position, scans = None, 2, 0
     while True:
@@ -52,17 +52,17 @@ def jpeg_size(data: bytes) -> tuple[int, int]:
             scans += 1
             following = _AFTER_SCAN_DATA.search(data, position)
             if following is None:
-                if size is not None and _reaches_the_end(data):
+                if size is not None and _is_complete(data):
                     break
                 raise DamagedFileError("the JPEG file is truncated")
             position = following.end() - 2
     if size is None or not scans:
-        raise DamagedFileError("the JPEG file holds no image")
+        raise DamagedFileError("the JPEG file contains no image")
     return size
 
 
-def _reaches_the_end(data: bytes) -> bool:
-    """Whether a JPEG file lacks its end marker only: without its last bytes the last block changes."""
+def _is_complete(data: bytes) -> bool:
+    """Whether a JPEG file lacks only its end marker: then cutting off its last bytes changes the last block."""
     whole, cut = (decoded(part + b"\xff\xd9") for part in (data, data[:-_TAIL_BYTES]))
     if whole is None or cut is None or whole.shape != cut.shape:
         return False
@@ -70,7 +70,7 @@ def _reaches_the_end(data: bytes) -> bool:
 
 
 def png_header(data: bytes) -> tuple[int, int, int]:
-    """Width, height, and bits of a channel, after a walk through the chunks of a PNG file (ISO/IEC 15948, clause 5).
+    """Check all chunks of a PNG file (ISO/IEC 15948, clause 5), and return its width, height and bits per channel.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Features and matching in a process of their own, where COLMAP may end without taking the job along.
+"""Extract and match features in a separate process, so that a crash of COLMAP becomes an error with a reason.
 
-COLMAP writes the database from threads, and a disk that gets full, a file that must not be written or memory that runs
-out there ends the process (``std::terminate``). Here that is an error with a reason, and what was finished stays.
+COLMAP writes the database from threads. A full disk, a read-only file or a lack of memory there terminates the process
+(``std::terminate``). The separate process keeps the job alive and the finished features in the database.
 """
 
 import json
@@ -32,9 +32,9 @@ from colmap_vg.options import FeatureOptions
 _TASKS: dict[str, Callable[..., object]] = {"features": extract_features, "matching": match_features}
 _LENGTH = struct.Struct("<Q")
 _WRITE_FAULTS = ("disk is full", "disk I/O error", "readonly database", "No space left", "File too large")
-"""What sqlite and the system say when a database cannot grow."""
-_LITTLE_ROOM = 2**18
-"""Bytes; a disk with less is full: what did not fit has been taken back."""
+"""Error messages of sqlite and the operating system when a database cannot grow."""
+_MIN_FREE_BYTES = 2**18
+"""Free bytes below which the disk counts as full; the data that did not fit have been removed again."""
 
 
 def extract_features_apart(
@@ -45,7 +45,7 @@ def extract_features_apart(
     log: StageLog,
     descriptors: Iterable[int] = (),
 ) -> tuple[list[str], list[SkippedFile]]:
-    """As :func:`extract_features`, in a process of its own.
+    """Run :func:`extract_features` in a separate process.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def extract_features_apart(
     OutputError
         The database cannot be written.
     ImageFolderError
-        COLMAP could read too few photographs, or came to an end of its own.
+        COLMAP could read too few photographs, or its process ended unexpectedly.
     """
     arguments = (os.fspath(image_path), database_path, list(names), options)
     with log.stage("features"):
@@ -70,7 +70,7 @@ def extract_features_apart(
 def match_features_apart(
     database_path: Path, options: FeatureOptions, log: StageLog, descriptors: Iterable[int] = ()
 ) -> int:
-    """As :func:`match_features`, in a process of its own; parameters and errors as above."""
+    """Run :func:`match_features` in a separate process; see :func:`extract_features_apart`."""
     with log.stage("matching"):
         num_pairs: int = _run_apart("matching", (database_path, options), database_path, log, descriptors)
     return num_pairs
@@ -79,9 +79,9 @@ def match_features_apart(
 def _run_apart(
     task: str, arguments: tuple[object, ...], database_path: Path, log: StageLog, descriptors: Iterable[int]
 ) -> Any:
-    """What a task returns in another process; its progress, warnings and result go to the log."""
+    """Run a task in a separate process and return its value; pass its progress, warnings and result to the log."""
     level = pycolmap.logging.minloglevel
-    # The path, too: the caller may have changed it, and the same code must run there.
+    # sys.path is passed on: the caller may have changed it, and the same code must run in the process.
     code = f"import sys; sys.path[:] = {sys.path!r}; from colmap_vg.features.isolated import serve; serve()"
     with TemporaryFile() as errors_file:
         verbose = level < pycolmap.logging.Level.FATAL.value
@@ -99,71 +99,71 @@ def _run_apart(
                 process.kill()
                 raise
         errors_file.seek(0)
-        said = errors_file.read().decode("utf-8", errors="replace")
+        output = errors_file.read().decode("utf-8", errors="replace")
     if answer is None:
-        raise _ended(process.returncode, said, database_path)
+        raise _process_error(process.returncode, output, database_path)
     if "error" in answer:
         kind = getattr(errors, answer["error"], None)
         if isinstance(kind, type) and issubclass(kind, ColmapVgError):
             raise kind(answer["message"])
-        raise _ended(0, f"{said}\n{answer['message']}", database_path)
+        raise _process_error(0, f"{output}\n{answer['message']}", database_path)
     return pickle.loads(bytes.fromhex(answer["value"]))
 
 
 def _talk(process: "subprocess.Popen[bytes]", request: bytes, log: StageLog) -> dict[str, str] | None:
-    """Send the request, pass on what is told, and return the last word; None when the process ended without one."""
+    """Send the request, pass messages to the log, and return the answer; None if the process ended without one."""
     stdin, stdout = process.stdin, process.stdout
     if stdin is None or stdout is None:  # both are pipes
         return None
     try:
         stdin.write(_LENGTH.pack(len(request)) + request)
-        stdin.flush()  # and left open: its end tells the process that this one is gone
+        stdin.flush()  # but not closed: the process ends itself when this pipe closes
     except BrokenPipeError:
         return None
     answer = None
     for line in stdout:
-        told = json.loads(line)
-        if told.get("state") == "progress":
-            log.progress(told["message"], told["fraction"])
-        elif told.get("state") == "warning":
-            log.warn(told["message"])
+        message = json.loads(line)
+        if message.get("state") == "progress":
+            log.progress(message["message"], message["fraction"])
+        elif message.get("state") == "warning":
+            log.warn(message["message"])
         else:
-            answer = told
-            log.result(told.get("result", ""))
+            answer = message
+            log.result(message.get("result", ""))
     return answer
 
 
-def _ended(code: int, said: str, database_path: Path) -> ColmapVgError:
-    """The error for a process that ended by itself."""
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
+def _process_error(code: int, output: str, database_path: Path) -> ColmapVgError:
+    """Make the error for a process that ended unexpectedly, from its exit code and output."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
     fault = next((line for line in lines if any(word in line for word in _WRITE_FAULTS)), None)
-    full = not database_path.parent.is_dir() or shutil.disk_usage(database_path.parent).free < _LITTLE_ROOM
+    full = not database_path.parent.is_dir() or shutil.disk_usage(database_path.parent).free < _MIN_FREE_BYTES
     if fault is not None or full:
         reason = next((word for word in _WRITE_FAULTS if fault is not None and word in fault), "the disk is full")
         return OutputError(
-            f"{database_path} cannot be written ({reason}): make room or choose another output_path, and go on with"
-            " resume=True"
+            f"{database_path} cannot be written ({reason}): free disk space and continue with resume=True, or choose"
+            " another output_path"
         )
     if -code == signal.SIGKILL:
         return ImageFolderError(
-            f"the process that worked on {database_path} was killed, most likely because memory ran out: lower"
-            " num_threads or max_image_size"
+            f"the process that extracted or matched features for {database_path} was killed, most likely because memory"
+            " ran out: lower num_threads or max_image_size"
         )
     reason = f"signal {signal.Signals(-code).name}" if code < 0 else f"code {code}"
     what = next((line for line in lines if "what()" in line or "Error" in line), lines[-1] if lines else "no message")
     return ImageFolderError(
-        f"COLMAP ended with {reason} while it worked on {database_path} ({what}); its log tells more"
+        f"COLMAP ended with {reason} while it extracted or matched features for {database_path} ({what}); see its log"
     )
 
 
 def serve() -> None:
-    """Do the one task that is asked for on standard input; end at once when the asking process is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the asking process, which ends this one
+    """Run the task requested on standard input, and end when the parent process ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what COLMAP prints must not come between the answers
+    os.dup2(2, 1)  # so that COLMAP's output does not mix with the answers
     request = _request(sys.stdin.buffer)
     if request is None:
-        return  # the asking process was gone before it had asked
+        return  # the parent ended before it sent a request
     level, task, arguments = pickle.loads(request)
     threading.Thread(target=_end_with, args=(sys.stdin.buffer,), daemon=True).start()
     pycolmap.logging.minloglevel = level
@@ -180,7 +180,7 @@ def serve() -> None:
 
 
 def _request(pipe: IO[bytes]) -> bytes | None:
-    """The pickled request; None where the pipe ends before it does."""
+    """Read the pickled request; None if the pipe ends before it is complete."""
     header = pipe.read(_LENGTH.size)
     if len(header) < _LENGTH.size:
         return None

@@ -1,4 +1,4 @@
-"""Masks of photographs: which file is whose, and whether it can be used."""
+"""Find the mask file of each photograph, and check that it can be used."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,10 +14,10 @@ _MASK_ENDINGS = (".png", ".mask.png", ".jpg", ".jpeg", ".mask.jpg", ".mask.jpeg"
 def with_masks(
     photographs: Sequence[Photograph], image_path: str | PathLike[str], mask_path: str | PathLike[str]
 ) -> tuple[list[Photograph], list[SkippedFile]]:
-    """Find the masks of photographs, and leave out those whose mask cannot be used.
+    """Find the masks of photographs, and skip photographs whose mask cannot be used.
 
-    The mask of ``folder/a.jpg`` is ``folder/a.jpg.png`` or ``folder/a.png``, as COLMAP has it, or these with
-    ``.mask.png``, ``.jpg`` or ``.mask.jpg`` in place of ``.png``, and has the photograph's size.
+    The mask of ``folder/a.jpg`` is ``folder/a.jpg.png`` or ``folder/a.png``, as in COLMAP, or one of these with
+    ``.mask.png``, ``.jpg`` or ``.mask.jpg`` in place of ``.png``. It must have the photograph's size.
 
     Parameters
     ----------
@@ -27,23 +27,23 @@ def with_masks(
     Returns
     -------
     kept : list of Photograph
-        Those without a mask, too; no file that is the mask of another.
+        Photographs with their masks, and those without one; files that are masks of others are dropped.
     skipped : list of SkippedFile
 
     Raises
     ------
     ImageFolderError
-        There is no such folder, or none of the photographs has a mask in it.
+        The folder of masks does not exist, or has a mask for none of the photographs.
     """
     masks = Path(mask_path)
     if not masks.is_dir():
-        raise ImageFolderError(f"no such mask folder: {masks}; check mask_path")
+        raise ImageFolderError(f"the mask folder {masks} does not exist; check mask_path")
     kept, skipped = [], []
     for photograph in photographs:
         mask = _mask_of(photograph.name, Path(image_path), masks)
         checked = None if mask is None else check_photograph(mask, str(mask))
         if isinstance(checked, SkippedFile):
-            skipped.append(SkippedFile(photograph.name, f"of its mask {mask}: {checked.reason}"))
+            skipped.append(SkippedFile(photograph.name, f"its mask {mask} cannot be used: {checked.reason}"))
         elif checked is not None and (checked.width, checked.height) != (photograph.width, photograph.height):
             sizes = f"{checked.width} x {checked.height} pixels, not {photograph.width} x {photograph.height}"
             skipped.append(SkippedFile(photograph.name, f"its mask {mask} is {sizes}"))
@@ -61,7 +61,7 @@ def with_masks(
 
 
 def _mask_of(name: str, images: Path, masks: Path) -> Path | None:
-    """The mask of a photograph; never the photograph itself, where masks lie beside them."""
+    """The mask file of a photograph, but never the photograph itself if masks are in the same folder; None without."""
     own = images / name
     named = (
         (masks / base).with_name((masks / base).name + ending)

@@ -1,12 +1,12 @@
-"""Which pairs of images are worth matching: the strongest features of all are matched first (preemptive matching).
+"""Select the pairs of images to match by preemptive matching, that is, from matches of their largest features only.
 
-The features of the largest scales are few, seen from afar, and stable, so pairs that see the same thing have some of
-them in common (C. Wu, Towards Linear-Time Incremental Structure from Motion, 3DV 2013, section 3). What they have in
-common by chance is told apart as in weak geometric consistency (Jégou, Douze and Schmid, ECCV 2008): right matches of a
-pair agree on how far the image is turned and scaled, wrong ones do not.
+Features of the largest scales are few and stable, so pairs that see the same objects have some of them in common
+(C. Wu, Towards Linear-Time Incremental Structure from Motion, 3DV 2013, section 3). Matches by chance are recognised by
+weak geometric consistency (Jégou, Douze and Schmid, ECCV 2008): correct matches of a pair agree on the rotation and the
+change of scale between the images, wrong ones do not.
 
-The descriptors are bytes, and their products, sums of 128 integers below 2**16, are exact in single precision: the
-result does not depend on the BLAS library, its threads or the order of the images' pairs.
+Descriptors are bytes, and their products, sums of 128 integers below 2**16, are exact in single precision, so the
+result does not depend on the BLAS library, its threads or the order of the pairs.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,22 +20,24 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from colmap_vg.linear.threads import single_threaded_blas
 
 STRONGEST_SHARE = 8
-"""One of so many features is matched first, by the median over the images."""
+"""One in this many of the median image's features is matched preemptively."""
 STRONGEST_LIMITS = (300, 1000)
-"""Features of each image that are matched first, at least and at most."""
+"""Minimum and maximum number of features per image that are matched preemptively."""
 _MAX_RATIO = 0.8
-"""Of the distances to the nearest and the second nearest descriptor, as in the matching that follows."""
+"""Maximum ratio of the distances to the nearest and the second nearest descriptor, as in the full matching."""
 _SQUARED_NORM = 512.0**2
-"""Of descriptors as COLMAP stores them: unit vectors times 512, rounded to bytes."""
+"""Squared norm of descriptors as COLMAP stores them: unit vectors times 512, rounded to bytes."""
 _ROTATION_BINS = 12
+"""Number of bins of the rotation between two images, 30 degrees each."""
 _SCALE_BINS = 10
-"""Octaves, of which the first and the last take what is beyond them."""
+"""Number of bins of the change of scale, one octave each; the first and the last also count what is beyond them."""
 _CHANCE = 0.2
-"""Share of wrong matches that agree: they favour the scales that are frequent, and images held the same way."""
+"""Share of wrong matches that agree by chance, since some scales and the same image orientation are frequent."""
 _KEPT = 0.98
-"""Share of what all pairs promise; of four scenes the chosen pairs kept 97 to 99.9 % of the inlier matches."""
+"""Share of the sum of all pair scores to reach; in four scenes the selected pairs had 97 to 99.9 % of the inlier
+matches."""
 MIN_PARTNERS = 8
-"""Images with which each image is matched at least, promising or not."""
+"""Minimum number of images with which each image is matched, whatever the pair scores."""
 
 FloatArray = NDArray[np.float32]
 IntArray = NDArray[np.int64]
@@ -44,14 +46,14 @@ CountArray = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class StrongestFeatures:
-    """The features of largest scale of n images, up to h of each.
+    """The features of largest scale of n images, at most h per image.
 
     Attributes
     ----------
     descriptors : (n, h, d) uint8 array
-        Of norm near 512; zero where an image has fewer features.
+        Norms are near 512; rows are zero where an image has fewer features.
     log2_scales : (n, h) array
-        Of the features' sizes in pixels.
+        Binary logarithms of the features' sizes in pixels.
     orientations : (n, h) array
         Radians.
     """
@@ -62,25 +64,26 @@ class StrongestFeatures:
 
 
 def num_strongest(num_features: Sequence[int]) -> int:
-    """How many features of each image are matched first, given how many the images have."""
+    """Number of features per image to match preemptively, from the numbers of features of all images."""
     typical = int(np.median(num_features)) if len(num_features) else 0
     return int(np.clip(typical // STRONGEST_SHARE, *STRONGEST_LIMITS))
 
 
 def strongest(keypoints: NDArray[np.float32], most: int) -> IntArray:
-    """Rows of the keypoints of largest scale, the largest first; of equal ones the first.
+    """Rows of the keypoints of largest scale in descending order, ties in the order of the rows.
 
     Parameters
     ----------
     keypoints : (k, 6) array
-        x, y and the affine shape a11, a12, a21, a22, as in COLMAP's databases.
+        x, y and the affine shape a11, a12, a21, a22, as in COLMAP's databases, pixels.
     most : int
+        Maximum number of rows.
     """
     return np.argsort(-_log2_scales(keypoints), kind="stable")[:most]
 
 
 def strongest_features(keypoints: list[NDArray[np.float32]], descriptors: list[NDArray[np.uint8]]) -> StrongestFeatures:
-    """Put the given features of all images, (k, 6) and (k, d) of each, side by side."""
+    """Collect keypoints (k, 6) and descriptors (k, d) of each image in arrays over all images."""
     most = max((len(own) for own in keypoints), default=0)
     width = max((own.shape[1] for own in descriptors), default=0)
     block = np.zeros((len(keypoints), most, width), np.uint8)
@@ -108,16 +111,17 @@ def preemptive_matches(
     ----------
     features : StrongestFeatures
     num_threads : int
-        Threads, each with one of BLAS; the result does not depend on them.
+        Number of threads, each with one BLAS thread; the result does not depend on it.
     on_progress : callable, optional
-        Called with the share that is done.
+        Called with the share of pairs that are done.
 
     Returns
     -------
     num_matches : (n, n) int32 array
         Mutually nearest features that pass the ratio test; symmetric.
     num_consistent : (n, n) int32 array
-        The most of them that agree on a rotation within 60 degrees and a change of scale within two octaves; symmetric.
+        The largest number of them that agree on a rotation within 60 degrees and a change of scale within two octaves;
+        symmetric.
     """
     n = len(features.descriptors)
     matches, consistent = np.zeros((n, n), np.int32), np.zeros((n, n), np.int32)
@@ -144,31 +148,31 @@ def preemptive_matches(
 def mutual_matches(
     first: FloatArray, second: FloatArray, products: FloatArray | None = None
 ) -> tuple[IntArray, IntArray]:
-    """Rows of two sets of descriptors that are each other's nearest, and nearer than the next by the ratio test.
+    """Rows of two sets of descriptors that are mutual nearest neighbours and pass the ratio test.
 
     Parameters
     ----------
     first, second : (h, d), (k, d) arrays
         Descriptors of norm near 512; rows of zeros match nothing.
     products : (h, k) array, optional
-        Room to work in: fresh memory for each pair costs as much as the products themselves.
+        Buffer for the products; to allocate one per pair takes as long as the products themselves.
     """
     if not len(first) or not len(second):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     products = np.matmul(first, second.T, out=products)
     nearest = products.argmax(axis=1)
     best = products[np.arange(len(first)), nearest]
-    rows = np.flatnonzero(products.max(axis=0)[nearest] == best)  # the largest: argmax along columns takes far longer
+    rows = np.flatnonzero(products.max(axis=0)[nearest] == best)  # argmax along columns would take far longer
     columns, best = nearest[rows], best[rows]
     products[rows, columns] = 0.0
     rivals = products.max(axis=1)[rows]
-    # Squared distances of unit vectors are 2 - 2 cos; what rounding leaves of the norm counts for nothing here.
+    # Squared distances of unit vectors are 2 - 2 cos; deviations of the norm by rounding are negligible.
     passed = _SQUARED_NORM - best < _MAX_RATIO**2 * (_SQUARED_NORM - rivals)
     return rows[passed], columns[passed]
 
 
 def _most_consistent(turned: NDArray[np.float64], scaled: NDArray[np.float64]) -> int:
-    """The most votes in two by two neighbouring bins of rotation, which is cyclic, and scale."""
+    """Largest number of votes in two by two adjacent bins of rotation, which is cyclic, and scale."""
     rotation = np.floor(turned * (_ROTATION_BINS / (2 * np.pi))).astype(np.int64) % _ROTATION_BINS
     scale = np.clip(np.floor(scaled).astype(np.int64) + _SCALE_BINS // 2, 0, _SCALE_BINS - 1)
     votes = np.bincount(rotation * _SCALE_BINS + scale, minlength=_ROTATION_BINS * _SCALE_BINS)
@@ -177,11 +181,12 @@ def _most_consistent(turned: NDArray[np.float64], scaled: NDArray[np.float64]) -
     return int((votes[:, 1:] + votes[:, :-1]).max())
 
 
-def promise(num_matches: CountArray, num_consistent: CountArray) -> NDArray[np.float64]:
-    """What each pair of images promises, in consistent matches of its strongest features.
+def pair_scores(num_matches: CountArray, num_consistent: CountArray) -> NDArray[np.float64]:
+    """Score each pair of images by the number of consistent matches of its strongest features beyond chance.
 
-    These are the matches by which a pair exceeds chance, two standard deviations included, and as much again by way of
-    third images: two that have much in common with the same ones are likely to have something in common, too.
+    A pair's own score is the number of consistent matches above the expected number by chance plus two standard
+    deviations. A second part, with the same sum over all pairs, comes from third images: two images that both match
+    the same others are likely to overlap, too.
 
     Parameters
     ----------
@@ -191,6 +196,7 @@ def promise(num_matches: CountArray, num_consistent: CountArray) -> NDArray[np.f
     Returns
     -------
     (n, n) array
+        Scores, in matches; symmetric.
     """
     by_chance = _CHANCE * num_matches
     excess = np.maximum(num_consistent - by_chance - 2.0 * np.sqrt(by_chance), 0.0)
@@ -200,21 +206,22 @@ def promise(num_matches: CountArray, num_consistent: CountArray) -> NDArray[np.f
     np.fill_diagonal(through_others, 0.0)
     if through_others.any():
         excess = excess + through_others * (excess.sum() / through_others.sum())
-    return np.asarray(np.round(excess, 6))  # so that the order does not hang on the last bit of a product
+    return np.asarray(np.round(excess, 6))  # so that the order does not depend on the last bit of a product
 
 
 @single_threaded_blas
 def select_pairs(num_matches: CountArray, num_consistent: CountArray, min_partners: int = MIN_PARTNERS) -> IntArray:
-    """Pairs that are worth matching in full.
+    """Select the pairs of images to match with all features.
 
-    These are the pairs that promise most, until together they promise nearly all there is, the best partners of each
-    image, and the best pairs that connect all images. Among equals, images that follow one another come first.
+    These are the pairs with the highest scores, up to nearly the sum of all scores; the best partners of each image;
+    and the best pairs that connect all images. Among equal scores, pairs of images that are close in order come first.
 
     Parameters
     ----------
     num_matches, num_consistent : (n, n) int32 arrays
         From :func:`preemptive_matches`.
     min_partners : int
+        Minimum number of pairs of each image.
 
     Returns
     -------
@@ -225,15 +232,15 @@ def select_pairs(num_matches: CountArray, num_consistent: CountArray, min_partne
     if n < 2:
         return np.empty((0, 2), np.int64)
     first, second = np.triu_indices(n, 1)
-    promised = promise(num_matches, num_consistent)[first, second]
-    order = np.lexsort((second - first, -num_matches[first, second], -num_consistent[first, second], -promised))
+    scores = pair_scores(num_matches, num_consistent)[first, second]
+    order = np.lexsort((second - first, -num_matches[first, second], -num_consistent[first, second], -scores))
     rank = np.empty(len(first), np.int64)
     rank[order] = np.arange(1, len(first) + 1)
     ranks = np.zeros((n, n), np.int64)
     ranks[first, second] = rank
-    before = np.concatenate([[0.0], np.cumsum(promised[order])])[:-1]
+    before = np.concatenate([[0.0], np.cumsum(scores[order])])[:-1]
     chosen = np.zeros((n, n), dtype=bool)
-    chosen[first[order], second[order]] = before < _KEPT * promised.sum()
+    chosen[first[order], second[order]] = before < _KEPT * scores.sum()
     chosen[minimum_spanning_tree(ranks).nonzero()] = True
     chosen |= chosen.T
     ranks += ranks.T

@@ -1,8 +1,8 @@
-"""Photographs and masks in a form that COLMAP reads, where it cannot read them as they are.
+"""Convert photographs and masks that COLMAP cannot read to PNG copies.
 
-Formats that OpenCV alone decodes, data of few bits in files of sixteen, and masks under other names become PNG copies
-in a folder of their own, with their EXIF data and under the photographs' names; the others are links in it. So there is
-one folder for COLMAP, whatever the photographs came as, and keypoints are in the pixels of the files as they are.
+Formats that only OpenCV decodes, 16-bit files that use fewer bits, and masks under other names are copied as PNG files
+to a separate folder, with their EXIF data and under the photographs' names; the other files become links in it. So
+COLMAP reads one folder, whatever the formats, and keypoints refer to the pixels of the original files.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +24,7 @@ from colmap_vg.options import FeatureOptions
 
 _AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
 _MASKED_BELOW = 128
-"""Of 255; black in a JPEG file is not quite."""
+"""Grey value (0 to 255) below which a pixel of a JPEG mask is masked: compression changes black slightly."""
 
 
 @contextmanager
@@ -34,7 +34,7 @@ def readable_folder(
     options: FeatureOptions,
     folder: Path,
 ) -> Iterator[tuple[Path, FeatureOptions]]:
-    """Folder of images and options whose masks COLMAP reads; copies are gone afterwards.
+    """Make temporary copies of photographs and masks that COLMAP cannot read.
 
     Parameters
     ----------
@@ -42,13 +42,14 @@ def readable_folder(
     photographs : sequence of Photograph
     options : FeatureOptions
     folder : Path
-        Made where copies are needed.
+        Folder for the copies, created if they are needed and removed at the end.
 
     Yields
     ------
     Path
-        `image_path` where COLMAP reads all photographs as they are.
+        Folder of images that COLMAP can read; `image_path` if no copies are needed.
     FeatureOptions
+        With a folder of masks that COLMAP can read.
 
     Raises
     ------
@@ -79,7 +80,7 @@ def readable_folder(
 
 
 def _named_otherwise(photograph: Photograph, masks: Path) -> bool:
-    """Whether COLMAP would not find the mask, or would leave the photograph out for want of one."""
+    """Whether COLMAP would not find the photograph's mask, or would skip the photograph because it has none."""
     return photograph.mask not in (masks / f"{photograph.name}.png", (masks / photograph.name).with_suffix(".png"))
 
 
@@ -90,7 +91,7 @@ def _made(folder: Path, name: str) -> Path:
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy as PNG with the metadata, in as many bits as the data have."""
+    """Copy a photograph as a PNG file with its metadata, stretched to the full range of its bits."""
     pixels, kinds, metadata = cv2.imreadWithMetadata(str(source), _AS_STORED)
     if pixels is None:
         raise ImageFolderError(f"{source} can no longer be decoded")
@@ -98,7 +99,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _mask(photograph: Photograph) -> NDArray[np.uint8]:
-    """White where features count."""
+    """Read a photograph's mask as 255 where features are extracted and 0 elsewhere; all 255 without a mask."""
     if photograph.mask is None:
         return np.full((photograph.height, photograph.width), 255, dtype=np.uint8)
     read = cv2.imread(str(photograph.mask), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -111,6 +112,6 @@ def _mask(photograph: Photograph) -> NDArray[np.uint8]:
 def _write_png(
     target: Path, pixels: NDArray[Any], metadata_kinds: Sequence[int] = (), metadata: Sequence[NDArray[Any]] = ()
 ) -> None:
-    """Write a PNG file under a name whose ending may say another format."""
+    """Write a PNG file; the ending of its name may be that of another format."""
     _, data = cv2.imencodeWithMetadata(".png", pixels, metadata_kinds, metadata)
     target.write_bytes(data.tobytes())

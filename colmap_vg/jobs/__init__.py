@@ -1,1 +1,1 @@
-"""What users run: from photographs or a database to models, with everything that is told of them."""
+"""Jobs that users run: from photographs or a database to models, with a summary and tables of verdicts."""

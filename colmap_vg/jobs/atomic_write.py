@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Write files atomically."""
 
 import os
 from contextlib import suppress
@@ -8,18 +8,18 @@ from colmap_vg.errors import OutputError
 
 
 def atomic_write(path: Path, text: str) -> None:
-    """Write a text file beside its place, and move it there.
+    """Write a text file atomically: to a temporary file in the same folder, then by renaming it.
 
     Parameters
     ----------
     path : Path
     text : str
-        Written as UTF-8; names of files that are not UTF-8 keep their bytes.
+        Written as UTF-8; file names in it that are not UTF-8 keep their bytes.
 
     Raises
     ------
     OutputError
-        It cannot be written; what stood there before still does.
+        The file cannot be written; an existing one is unchanged.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -28,4 +28,6 @@ def atomic_write(path: Path, text: str) -> None:
     except OSError as error:
         with suppress(OSError):
             temporary.unlink()
-        raise OutputError(f"cannot write {path}: {error.strerror}; make room or choose another output_path") from error
+        raise OutputError(
+            f"cannot write {path}: {error.strerror}; free disk space or choose another output_path"
+        ) from error

@@ -1,4 +1,4 @@
-"""What links the models of a job, and where few pairs hold one together: how firm it is, and what is missing."""
+"""Describe the pairs that link the models of a job, and the weak cuts within each model."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ MAX_MODELS, MAX_PAIRS_SHOWN, MAX_IMAGES_SHOWN = 10, 10, 10
 
 @dataclass(frozen=True)
 class LinkingPair:
-    """A verified pair of images of two models, or of two sides of one."""
+    """A verified pair between two models, or between the two sides of a weak cut."""
 
     images: tuple[str, str]
     verdict: str
@@ -29,26 +29,27 @@ class LinkingPair:
 
 @dataclass(frozen=True)
 class Bridge:
-    """What links two models, or two sides of one.
+    """The link between two models, or between the two sides of a weak cut in one model.
 
     Attributes
     ----------
     models : tuple of int
-        Twice the same for sides of one model.
+        Both models; the same index twice for a cut within a model.
     images : tuple of str
-        Of the smaller side of a model, the first ones; empty between two models.
+        Names of the first images of a cut's smaller side; empty between two models.
     num_images : int
-        Of that side; 0 between two models.
+        Number of images of that side; 0 between two models.
     num_pairs, num_inliers : int
-        Verified pairs that link, and their inlier matches.
+        Number of verified pairs across, and of their inlier matches.
     strongest : tuple of LinkingPair
+        The pairs with most inlier matches.
     share_seen, share_seen_elsewhere : float or None
-        Of points that one side sees and near images of the other should, the share that these see; and that of such
-        points within the sides. None where nothing can be told, and between models.
+        Share of the expected observations that exist, across the cut and within its sides; see `WeakCut`. None
+        between models; `share_seen` also where no observations are expected.
     firm : bool
-        Whether the sides show one place as far as can be told; models are two because nothing firm links them.
+        Whether the expected observations do not contradict that the sides show one place; False between models.
     told : str
-        All that in a sentence, and what is missing.
+        A sentence that describes the link, and what is missing.
     """
 
     models: tuple[int, int]
@@ -66,14 +67,14 @@ class Bridge:
 def all_bridges(
     graph: ViewGraph, solution: PoseSolution, weak_cuts: Sequence[Sequence[WeakCut]] = ()
 ) -> tuple[Bridge, ...]:
-    """Bridges between all models of a solution, and within each.
+    """List the bridges within each model of a solution, and between its models.
 
     Parameters
     ----------
     graph : ViewGraph
     solution : PoseSolution
     weak_cuts : sequence of sequences of WeakCut
-        Of each model.
+        The weak cuts of each model.
     """
     found = [_within(graph, solution, model, cut) for model, cuts in enumerate(weak_cuts) for cut in cuts]
     last = min(int(solution.component.max(initial=-1)), MAX_MODELS - 1)
@@ -86,30 +87,27 @@ def _between(graph: ViewGraph, solution: PoseSolution, a: int, b: int) -> Bridge
     rows = np.flatnonzero((ends == [a, b]).all(axis=1))
     strongest, num_inliers = _strongest(graph, solution, rows), _num_inliers(graph, rows)
     if len(rows) == 0:
-        told = (
-            f"no pair links models {a} and {b}: photographs that overlap both are missing, two or more from places"
-            " between them"
-        )
+        told = f"no pair links models {a} and {b}: add two or more photographs, taken between them, that overlap both"
     else:
         first, second = strongest[0].images
         told = (
-            f"{_pairs(len(rows))} with {num_inliers} inlier matches link models {a} and {b}, the strongest {first} and"
-            f" {second}, {_why_not(solution, rows)}"
+            f"{_pairs(len(rows))} with {num_inliers} inlier matches link models {a} and {b} (the strongest: {first} and"
+            f" {second}), {_why_not(solution, rows)}"
         )
     return Bridge((a, b), (), 0, len(rows), num_inliers, strongest, None, None, False, told)
 
 
 def _why_not(solution: PoseSolution, rows: IntArray) -> str:
-    """Why pairs do not make one model of two, and what would."""
+    """Clause on why pairs do not join two models, and which photographs would."""
     verdicts = Counter(solution.edge_verdicts[rows].tolist())
     usable = sum(verdicts[str(word)] for word in (EdgeVerdict.KEPT, EdgeVerdict.OUTSIDE))
     if usable:
         return (
-            "but neither their directions nor tracks through three images fix how the two lie to each other: one more"
-            " photograph that overlaps these two and a neighbour of each would"
+            "but neither their directions nor tracks through three images determine the relative position of the"
+            " models: add a photograph that overlaps these two images and a neighbour of each"
         )
     reasons = ", ".join(f"{count} {word}" for word, count in verdicts.most_common())
-    return f"but none of them can be relied on ({reasons}): two photographs or more that overlap both would tell"
+    return f"but none of them is reliable ({reasons}): add two or more photographs that overlap both models"
 
 
 def _within(graph: ViewGraph, solution: PoseSolution, model: int, cut: WeakCut) -> Bridge:
@@ -118,19 +116,22 @@ def _within(graph: ViewGraph, solution: PoseSolution, model: int, cut: WeakCut) 
     rows = np.flatnonzero((ends[:, 0] != ends[:, 1]) & (solution.component[graph.edges] == model).all(axis=1))
     names = [name for name, own in zip(image_names(graph), inside.tolist(), strict=True) if own]
     told = (
-        f"{len(names)} images of model {model} ({names[0]} to {names[-1]}) are held to the rest by"
+        f"{len(names)} images of model {model} ({names[0]} to {names[-1]}) are linked to the rest by only"
         f" {_pairs(cut.num_pairs)} with {cut.num_matches} matches"
     )
     seen = cut.share_seen if cut.num_expected else None
     if seen is None:
-        told += "; no images of both sides look at points from nearly the same side, to confirm it"
+        told += "; this cannot be confirmed, since no images of the two sides have similar views of the same points"
     elif cut.contradicted:
         told += (
-            f", but only {seen:.2f} of what both sides should see is seen by both ({cut.share_seen_elsewhere:.2f}"
-            " elsewhere): they may show another place that looks alike"
+            f", and both sides see only a share of {seen:.2f} of the points that both should see"
+            f" ({cut.share_seen_elsewhere:.2f} elsewhere): they may show another place that looks alike"
         )
     else:
-        told += f"; {seen:.2f} of what both sides should see is seen by both ({cut.share_seen_elsewhere:.2f} elsewhere)"
+        told += (
+            f"; both sides see a share of {seen:.2f} of the points that both should see"
+            f" ({cut.share_seen_elsewhere:.2f} elsewhere)"
+        )
     return Bridge(
         (model, model),
         tuple(names[:MAX_IMAGES_SHOWN]),

@@ -1,7 +1,7 @@
-"""From a folder of photographs to models: features, matching and mapping in one output folder, with resume.
+"""From a folder of photographs to models: feature extraction, matching and mapping, with resume.
 
-The database is made as ``OUT/.work/database.db`` and becomes ``OUT/database.db`` when it is finished, so a database in
-the output folder is never half made. ``OUT/.work/features.json`` says from what it was made.
+The database is built at ``OUT/.work/database.db`` and renamed to ``OUT/database.db`` when it is finished, so a database
+in the output folder is always complete. ``OUT/.work/features.json`` records the files and options it was made from.
 """
 
 import json
@@ -45,12 +45,12 @@ def image_folder_mapping(
     image_path : path
         Folder of photographs, searched recursively.
     output_path : path
-        Receives ``database.db`` and the models ``0``, ``1``, ...
+        Folder for ``database.db`` and the models ``0``, ``1``, ...
     features : FeatureOptions, optional
     options : MappingOptions, optional
-        With ``overwrite``, models and a database that are there already are replaced.
+        With ``overwrite``, existing models and an existing database are replaced.
     on_event : callable, optional
-        Called with a `StageEvent` whenever a stage starts, gets on, ends, or has something to warn of.
+        Called with a `StageEvent` whenever a stage starts, progresses, ends or warns.
 
     Returns
     -------
@@ -88,8 +88,8 @@ def make_database(
     overwrite : bool
         Accept an output folder that holds models, and replace a database that was not made by this function.
     resume : bool
-        Reuse the finished database, or go on with an unfinished one, when it was made from the same photographs with
-        the same options; otherwise say so, and start afresh.
+        Reuse a finished database, or continue an unfinished one, if it was made from the same photographs with the
+        same options; otherwise warn and start again.
 
     Returns
     -------
@@ -100,14 +100,14 @@ def make_database(
     ImageFolderError
         The photographs cannot be used.
     OutputError
-        The output cannot be written, or holds models, or a database made by something else.
+        The output cannot be written, or holds models or a database that this function did not make.
     """
     options, log = FeatureOptions.given(options), log or StageLog()
     refuse_models(output_path, overwrite)
     finished, record_path = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME / RECORD_NAME
     if finished.exists() and not record_path.exists() and not overwrite:
         raise OutputError(
-            f"{finished} is there already, and colmap-vg did not make it here: map it with "
+            f"{finished} already exists and was not made by this job: map it with "
             f"view_graph_mapping, choose another output_path, or replace it with overwrite=True"
         )
     output = Path(output_path).resolve()
@@ -124,9 +124,9 @@ def make_database(
             readable = tuple(name for name in names if name in known)
             return FeatureResult(readable, tuple(skipped), _num_verified(finished))
         if resume and record_path.exists() and not same:
-            log.warn(f"{work} was made from other photographs or with other options: features are extracted afresh")
+            log.warn(f"{work} was made from other photographs or with other options: features are extracted again")
         if not same:
-            _start_afresh(finished, unfinished, record_path, record)
+            _remove_previous(finished, unfinished, record_path, record)
         with readable_folder(image_path, photographs, options, work / COPIES_NAME) as (folder, reading):
             names, unreadable = extract_features_apart(folder, unfinished, names, reading, log, lock_descriptors())
         num_verified_pairs = match_features_apart(unfinished, options, log, lock_descriptors())
@@ -137,8 +137,11 @@ def make_database(
         return FeatureResult(tuple(names), (*skipped, *unreadable), num_verified_pairs)
 
 
-def _start_afresh(finished: Path, unfinished: Path, record_path: Path, record: dict[str, object]) -> None:
-    """Remove what an earlier job made, its record first: a job killed in between leaves nothing that seems whole."""
+def _remove_previous(finished: Path, unfinished: Path, record_path: Path, record: dict[str, object]) -> None:
+    """Remove the database of an earlier job and write a new record.
+
+    The old record is removed first, so that a job killed in between leaves nothing that seems complete.
+    """
     try:
         record_path.unlink(missing_ok=True)
         for path in (finished, *unfinished.parent.glob(f"{DATABASE_NAME}*")):
@@ -151,7 +154,7 @@ def _start_afresh(finished: Path, unfinished: Path, record_path: Path, record: d
 
 
 def _record(image_path: str | PathLike[str], names: list[str], options: FeatureOptions) -> dict[str, object]:
-    """What a database depends on: the files with their sizes and times, and the options but for the threads."""
+    """Record what a database depends on: files with sizes and times, and all options but those without an effect."""
     folder = Path(image_path)
     files = [(name, (folder / name).stat()) for name in names]
     kept = {key: value for key, value in asdict(options).items() if key not in ("num_threads", "image_list_path")}
@@ -161,7 +164,7 @@ def _record(image_path: str | PathLike[str], names: list[str], options: FeatureO
         "files": [[name, status.st_size, status.st_mtime_ns] for name, status in files],
         "options": kept,
     }
-    normal: dict[str, object] = json.loads(json.dumps(record))  # tuples become lists, as in a record that was read
+    normal: dict[str, object] = json.loads(json.dumps(record))  # tuples become lists, as in a record read from a file
     return normal
 
 
@@ -173,7 +176,7 @@ def _read_record(path: Path) -> object:
 
 
 def image_names(database_path: Path) -> list[str]:
-    """Names of a database's images by id, read without changing the file.
+    """Names of a database's images in the order of their ids, read without changing the file.
 
     Raises
     ------
@@ -188,7 +191,7 @@ def _num_verified(database_path: Path) -> int:
 
 
 def _query(database_path: Path, statement: str) -> list[tuple[str | int, ...]]:
-    """Read without pycolmap, which changes every database that it opens."""
+    """Query a database without pycolmap, which changes every database that it opens."""
     # Without "immutable", reading a database in COLMAP's WAL mode leaves -wal and -shm files beside it.
     mode = "mode=ro" if Path(f"{database_path}-wal").exists() else "mode=ro&immutable=1"
     connection = sqlite3.connect(f"{database_path.resolve().as_uri()}?{mode}", uri=True)

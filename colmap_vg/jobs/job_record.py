@@ -1,7 +1,7 @@
-"""What became of an output folder's last job, so that ``--resume`` knows what it may replace and what is done.
+"""Record of an output folder's last job, from which ``--resume`` decides what is finished and what may be replaced.
 
-``OUT/.work/job.json`` holds the verb, the options and whether the job came to its end. Models are published before the
-summary is written: models of a job that was killed in between are the job's own, and a resumed one replaces them.
+``OUT/.work/job.json`` holds the verb, the options and whether the job finished. Models are published before the summary
+is written; if a job is killed in between, a resumed one replaces them.
 """
 
 import hashlib
@@ -21,14 +21,14 @@ RECORD_NAME = "job.json"
 
 @dataclass(frozen=True)
 class JobState:
-    """What a job finds in its output folder.
+    """State of the output folder when a job starts.
 
     Attributes
     ----------
     finished : bool
-        The same job came to its end before, and its models and summary are there.
+        Whether the same job finished before, and its models and summary exist.
     overwrite : bool
-        Models that are there may be replaced: asked for, or left by the interrupted job that is resumed.
+        Whether existing models may be replaced: on request, or because the interrupted job that is resumed left them.
     """
 
     finished: bool
@@ -39,22 +39,22 @@ class JobState:
 def recorded_job(
     output_path: Path,
     verb: str,
-    asked: Mapping[str, object],
+    inputs: Mapping[str, object],
     source: Path | None,
     *,
     overwrite: bool,
     resume: bool,
 ) -> Iterator[JobState]:
-    """Lock the output folder for a job, and keep the record of how far it came.
+    """Lock the output folder for a job, and record whether the job finished.
 
     Parameters
     ----------
     output_path : Path
     verb : str
-    asked : mapping of str to object
+    inputs : mapping of str to object
         The job's inputs and options.
     source : Path or None
-        Database or image folder: the same job is one on the same files.
+        Database or image folder; jobs on different files are different jobs.
     overwrite, resume : bool
 
     Yields
@@ -64,12 +64,12 @@ def recorded_job(
     Raises
     ------
     OutputError
-        Another job is at work in the folder, it cannot be written, or it holds models that must not be replaced.
+        Another job is running in the folder, it cannot be written, or it holds models that must not be replaced.
     """
     with output_lock(output_path):
         path = output_path / WORK_NAME / RECORD_NAME
         job = json.loads(
-            json.dumps({"verb": verb, "options": _inputs(plain(asked)), "source": _fingerprint(source, output_path)})
+            json.dumps({"verb": verb, "options": _inputs(plain(inputs)), "source": _fingerprint(source, output_path)})
         )
         before = _read(path) if resume else {}
         models = existing_models(output_path)
@@ -88,15 +88,15 @@ def recorded_job(
         atomic_write(path, json.dumps({**job, "finished": True}, indent=1))
 
 
-def _inputs(asked: object) -> object:
-    """The options that a result depends on."""
-    if isinstance(asked, Mapping):
-        return {name: _inputs(value) for name, value in asked.items() if name not in ("overwrite", "resume")}
-    return asked
+def _inputs(inputs: object) -> object:
+    """Options without those that the result does not depend on."""
+    if isinstance(inputs, Mapping):
+        return {name: _inputs(value) for name, value in inputs.items() if name not in ("overwrite", "resume")}
+    return inputs
 
 
 def _fingerprint(source: Path | None, output_path: Path) -> str:
-    """Names, sizes and times of a file, or of the files in a folder but for those that jobs write there."""
+    """Hash of the names, sizes and times of a file, or of the files in a folder except those that jobs write there."""
     if source is None:
         return ""
     if source.is_dir():
@@ -105,20 +105,20 @@ def _fingerprint(source: Path | None, output_path: Path) -> str:
         files = [source]
     digest = hashlib.sha256()
     for file in files:
-        with suppress(OSError):  # the job itself will tell
+        with suppress(OSError):  # the job itself reports files that cannot be read
             status = file.stat()
             digest.update(f"{file}\0{status.st_size}\0{status.st_mtime_ns}\0".encode(errors="surrogateescape"))
     return digest.hexdigest()
 
 
 def _is_written(file: Path, source: Path, output_path: Path) -> bool:
-    """Whether a job writes the file, or may have: its output lies in the folder of its photographs, or is that folder.
+    """Whether a job may have written the file: its output folder is inside the image folder, or is the same folder.
 
-    The photographs of a demo lie in its output folder, the other way round.
+    The images of a demo lie inside its output folder instead, and count as input.
     """
     output = output_path.resolve()
     if file.is_dir():
-        return True  # by its files
+        return True  # folders count by their files
     if source.resolve() in output.parents:
         return output in file.resolve().parents
     first = file.relative_to(source).parts[0] if source.resolve() == output else ""

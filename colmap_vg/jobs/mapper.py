@@ -1,4 +1,4 @@
-"""From a COLMAP database to models: read the viewing graph, solve it, build the model, write it whole or not at all."""
+"""From a COLMAP database to models: read the viewing graph, solve it, build the models and write them atomically."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,14 +14,14 @@ from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.quiet import quiet_colmap
 from colmap_vg.colmap_io.raw_matches import compared_pairs
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
-from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_own_cameras
+from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cameras
 from colmap_vg.errors import MappingError
 from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.mapping.build import (
+    CONVERGED_COST_RATIO,
     MAX_NUM_ROUNDS,
-    SETTLED_COST,
     BuildResult,
     adjust_once_more,
     build_model,
@@ -41,18 +41,18 @@ from colmap_vg.solver.agreement import pair_agreement
 from colmap_vg.solver.solve import solve_view_graph
 from colmap_vg.solver.state import described
 
-SAME_LENS_COST = 0.8
-"""Share of its cost that bundle adjustment must leave when cameras that shared a calibration get their own: 0.98 to
-0.99 was left where there was one lens and images were strong, 0.89 where they were weak."""
+SHARED_LENS_COST_RATIO = 0.8
+"""Ratio of final to initial cost of bundle adjustment with one calibration per camera, below which shared calibrations
+are given up. With a single lens it was 0.98 to 0.99 for images with many observations, 0.89 for those with few."""
 ROUGH_MATCHES = 100
-"""Of a pair, for solutions that points are to compare."""
+"""Maximum number of matches per pair in the solutions that are compared by their points."""
 FALSE_PAIRS = (EdgeVerdict.EXCLUDED, EdgeVerdict.ROTATION_OUTLIER)
-"""Pairs whose matches are kept out of the points: a rotation that far off is not one of noise."""
+"""Verdicts of pairs that are excluded from triangulation: the user's, and those with a rotation error beyond noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class MappingResult:
-    """What a mapping job found.
+    """Result of a mapping job.
 
     Attributes
     ----------
@@ -60,10 +60,10 @@ class MappingResult:
         As written, the largest first.
     graph : ViewGraph
     solution : PoseSolution
-        With the poses, focal factors, image verdicts, agreement and residuals of the finished models, in their frames;
-        edge verdicts, radial terms and covariances as solved.
+        Poses, focal factors, image verdicts, agreement and residuals are those of the finished models, in their frames;
+        edge verdicts, radial terms and covariances are those of the viewing graph's solution.
     weak_cuts : tuple of tuples of WeakCut
-        Of each model: where few pairs hold it together, and what its points say of that.
+        For each model, the cuts that few pairs cross.
     """
 
     models: dict[int, "pycolmap.Reconstruction"]
@@ -79,19 +79,19 @@ def view_graph_mapping(
     options: MappingOptions | None = None,
     on_event: Callable[[StageEvent], None] | None = None,
 ) -> dict[int, "pycolmap.Reconstruction"]:
-    """Make models from a database of verified matches, in place of ``pycolmap.global_mapping``.
+    """Make models from a database of verified matches, as ``pycolmap.global_mapping`` does.
 
     Parameters
     ----------
     database_path : path
         Never modified.
     image_path : path or None
-        Folder of the photographs, for the colours of points; without it they stay black.
+        Folder of the photographs, for the colours of points; without it they are black.
     output_path : path
-        Models are written to ``output_path/0``, ``output_path/1``, ...; they appear whole or not at all.
+        Models are written to ``output_path/0``, ``output_path/1``, ..., each atomically.
     options : MappingOptions, optional
     on_event : callable, optional
-        Called with a `StageEvent` whenever a stage starts, gets on, ends, or has something to warn of.
+        Called with a `StageEvent` whenever a stage starts, progresses, ends or warns.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def view_graph_mapping(
     MappingError
         No model could be made.
     OptionError
-        The options are of another kind.
+        `options` is not a `MappingOptions`.
     """
     options = MappingOptions.given(options)
     with quiet_colmap():
@@ -121,7 +121,7 @@ def map_database(
     options: MappingOptions,
     log: StageLog,
 ) -> MappingResult:
-    """As :func:`view_graph_mapping`, with the stages in the caller's log, the graph and the verdicts.
+    """Make models as :func:`view_graph_mapping` does, with the caller's log; also return the graph and the solution.
 
     Parameters
     ----------
@@ -151,7 +151,8 @@ def map_database(
         if not built:
             raise MappingError(
                 f"{database_path}: {int((solution.component >= 0).sum())} poses were solved, but no three images share"
-                " points at an angle that could fix them; add overlapping photographs, taken from different places"
+                " enough points with a sufficient triangulation angle; add overlapping photographs, taken from"
+                " different places"
             )
         cuts = _weak_cuts(database_path, graph, built, log)
         with log.stage("write"):
@@ -169,7 +170,7 @@ def map_database(
 
 @dataclass(frozen=True)
 class _Model:
-    """A finished model, and what changed on the way."""
+    """A finished model and the result of building it."""
 
     reconstruction: "pycolmap.Reconstruction"
     result: BuildResult
@@ -183,7 +184,7 @@ def _build(
     options: MappingOptions,
     log: StageLog,
 ) -> list[_Model]:
-    """Models of all components that the points support, the one with most images first."""
+    """Build models of all components with enough points, and sort them by number of images, the largest first."""
     refined = options.ba_refine_focal_length or options.ba_refine_principal_point or options.ba_refine_extra_params
     shared = shared_cameras(graph) if options.share_cameras and refined else []
     without = _false_pairs(graph, solution)
@@ -205,7 +206,7 @@ def _build(
             models.append(_Model(reconstruction, result))
         elif len(posed) > 1:
             count = int((solution.component == component).sum())
-            log.warn(f"{count} images that seemed a model of their own share no points that could fix them.")
+            log.warn(f"A component of {count} images shares too few points for a model of its own; it is dropped.")
     if len(models) > 1:
         usable = ~np.isin(solution.edge_verdicts, FALSE_PAIRS)
         models = _joined(cache, models, graph, usable, pairs, _compared(database_path, graph), options, log)
@@ -215,7 +216,7 @@ def _build(
             loaded_cache(database_path, work, options.read.min_num_inliers, (), without, graph) as (cache, _),
         ):
             models = [
-                replace(m, reconstruction=_on_own_cameras(cache, m.reconstruction, replaced, options, log))
+                replace(m, reconstruction=_with_database_cameras(cache, m.reconstruction, replaced, options, log))
                 for m in models
             ]
     return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
@@ -231,19 +232,19 @@ def _joined(
     options: MappingOptions,
     log: StageLog,
 ) -> list[_Model]:
-    """The models, those put together that share points which agree on how they lie to each other."""
+    """Join models whose shared points agree on the similarity between them, while the joined model is consistent."""
     refused: set[frozenset[int]] = set()
     while True:
         with log.stage("join"):
             models = sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
             first, second, joint = _best_joint(models, graph, usable, refused, options.random_seed)
             if joint.similarity is None:
-                log.result("one model" if len(models) == 1 else f"{len(models)} models, no two of which share points")
+                log.result("one model" if len(models) == 1 else f"{len(models)} models, none of which can be joined")
                 return models
             own, other = models[first].reconstruction, models[second].reconstruction
             log.result(
                 f"models of {own.num_reg_images()} and {other.num_reg_images()} images share {joint.num_shared} points,"
-                f" {joint.num_agreeing} of which agree on how the two lie to each other"
+                f" {joint.num_agreeing} of which agree on the similarity between them"
             )
         posed = joined_poses(loaded_reconstruction(cache), own, other, joint.similarity)
         both, moved = set(posed.reg_image_ids()), set(other.reg_image_ids())
@@ -259,13 +260,13 @@ def _joined(
         refused.add(frozenset(own.reg_image_ids()) | frozenset(moved))
         log.warn(
             f"Models of {own.num_reg_images()} and {len(moved)} images share points, but are not joined: adjusted"
-            f" together they lose {len(both - set(posed.reg_image_ids()))} images, and of what both should see"
-            f" {cut.share_seen:.2f} is seen by both ({cut.share_seen_elsewhere:.2f} elsewhere)."
+            f" together they lose {len(both - set(posed.reg_image_ids()))} images, and both see a share of"
+            f" {cut.share_seen:.2f} of the points that both should see ({cut.share_seen_elsewhere:.2f} elsewhere)."
         )
 
 
 def _compared(database_path: str | PathLike[str], graph: ViewGraph) -> NDArray[np.int64]:
-    """Ids of images (k, 2) that were compared, without the pairs that the user excluded: their matches are not used."""
+    """Image ids (k, 2) of the pairs that were compared, without those that the user excluded."""
     pairs = np.sort(compared_pairs(database_path), axis=1)
     if graph.read_verdicts is None:
         return pairs
@@ -281,7 +282,7 @@ def _best_joint(
     refused: set[frozenset[int]],
     seed: int,
 ) -> tuple[int, int, Joint]:
-    """The two models that most shared points join; a joint without a similarity where there are none."""
+    """The two models with the most shared points that agree on a similarity; `Joint.similarity` is None without any."""
     best = 0, 0, Joint(0, 0, None)
     for a, one in enumerate(models):
         for b in range(a + 1, len(models)):
@@ -302,16 +303,16 @@ def _second_opinion(
     options: MappingOptions,
     log: StageLog,
 ) -> PoseSolution:
-    """Of a solution and other arrangements of its images, the one in whose images most is seen of what should be."""
+    """Choose among a solution's arrangements of the images by their missing correspondences."""
     with log.stage("second opinion"):
-        # All of them roughly, so that none is judged better because more was done for it.
+        # All arrangements are solved with the same reduced effort, so that the comparison is fair.
         rough = replace(_solve_options(options), refine_focal_lengths="never", max_matches_per_edge=ROUGH_MATCHES)
         found = [
             _point_evidence(database_path, work, graph, solve_view_graph(graph, rough, rotations), options)
             for rotations in solution.arrangements
         ]
         shown = ", ".join(f"{evidence.share_seen:.2f}" for evidence in found)
-        log.result(f"of the points that images should see, so large a share is seen in each arrangement: {shown}")
+        log.result(f"share of the points that images should see and do see, per arrangement: {shown}")
         best, settled = best_arrangement(found)
         chosen, in_doubt = solution, None if settled else solution.in_doubt
         if best > 0:
@@ -319,14 +320,14 @@ def _second_opinion(
             for caveat in chosen.caveats:
                 log.warn(caveat)
             log.warn(
-                "Pairs agree with another arrangement of the images more, but there images do not see what they should:"
-                f" {found[best].share_seen:.2f} of it is seen in the arrangement that is used,"
-                f" {found[0].share_seen:.2f} in the other."
+                "More pairs agree with another arrangement of the images, but in it images do not see the points that"
+                f" they should: their share is {found[0].share_seen:.2f}, and {found[best].share_seen:.2f} in the"
+                " arrangement that is used."
             )
         elif settled and solution.in_doubt is not None:
             log.warn(
-                "The points settle between them: this arrangement's images see"
-                f" {found[0].share_seen:.2f} of what they should."
+                "The points confirm the arrangement that is used: its images see a share of"
+                f" {found[0].share_seen:.2f} of the points that they should see."
             )
         status, message = described(chosen.image_verdicts, chosen.converged, chosen.agreement, in_doubt is not None)
         return replace(chosen, in_doubt=in_doubt, status=status, message=message)
@@ -343,13 +344,13 @@ def _point_evidence(
 
 
 def _false_pairs(graph: ViewGraph, solution: PoseSolution) -> list[tuple[int, int]]:
-    """Image ids of pairs whose matches are kept out of the points."""
+    """Image ids of the pairs that are excluded from triangulation."""
     false = np.isin(solution.edge_verdicts, FALSE_PAIRS)
     return [(int(a), int(b)) for a, b in graph.image_ids[graph.edges[false]]]
 
 
 def _pair_rotations(graph: ViewGraph) -> PairRotations:
-    """Of pairs whose matches have a rotation of their own, whatever the solver thought of it."""
+    """Relative rotations of all pairs that have one, whatever their verdict."""
     posed = graph.has_rotation
     matches = np.ones(graph.num_edges) if graph.num_inliers is None else graph.num_inliers.astype(np.float64)
     return PairRotations(graph.image_ids[graph.edges[posed]], graph.cam2_from_cam1_rotations[posed], matches[posed])
@@ -359,7 +360,7 @@ def _read(database_path: str | PathLike[str], options: MappingOptions, log: Stag
     with log.stage("view graph"):
         read = replace(options.read, random_seed=options.random_seed)
         if not options.ba_refine_focal_length:
-            # Who keeps bundle adjustment from focal lengths wants them as they are.
+            # Focal lengths that bundle adjustment must not refine are not changed here either.
             read = replace(read, trust_focal_lengths="always")
         if not options.ba_refine_extra_params:
             read = replace(read, find_distortion=False)
@@ -384,32 +385,32 @@ def _solve_options(options: MappingOptions) -> SolveOptions:
     return solve if options.ba_refine_focal_length else replace(solve, refine_focal_lengths="never")
 
 
-def _on_own_cameras(
+def _with_database_cameras(
     cache: "pycolmap.DatabaseCache",
     shared: "pycolmap.Reconstruction",
     replaced: dict[int, int],
     options: MappingOptions,
     log: StageLog,
 ) -> "pycolmap.Reconstruction":
-    """The model on the database's own cameras, with the shared calibrations unless these cost too much."""
-    trial = with_own_cameras(cache, shared, replaced)
-    left = adjust_once_more(cache, trial, options)
-    if left < SAME_LENS_COST:
+    """Give a model the database's own cameras; with the shared calibrations unless separate ones fit clearly better."""
+    trial = with_database_cameras(cache, shared, replaced)
+    cost_ratio = adjust_once_more(cache, trial, options)
+    if cost_ratio < SHARED_LENS_COST_RATIO:
         for _ in range(MAX_NUM_ROUNDS):
-            if adjust_once_more(cache, trial, options) > SETTLED_COST:
+            if adjust_once_more(cache, trial, options) > CONVERGED_COST_RATIO:
                 break
-        log.result(f"the photographs show different lenses: calibrated one by one, the cost falls by {1.0 - left:.0%}")
+        log.result(f"different lenses: with separate calibrations the cost falls by {1.0 - cost_ratio:.0%}")
         return trial
-    log.result(f"one lens: calibrated one by one, the cost would fall by {1.0 - left:.1%} only")
-    model = with_own_cameras(cache, shared, replaced)
-    model.tear_down()  # of the cameras, rigs and images of other models
+    log.result(f"one lens: with separate calibrations the cost would fall by only {1.0 - cost_ratio:.1%}")
+    model = with_database_cameras(cache, shared, replaced)
+    model.tear_down()  # removes the cameras, rigs and images of other models
     return model
 
 
 def _weak_cuts(
     database_path: str | PathLike[str], graph: ViewGraph, models: Sequence[_Model], log: StageLog
 ) -> tuple[tuple[WeakCut, ...], ...]:
-    """Of each model, where few pairs hold it together; with a warning where its points speak against them."""
+    """Find the weak cuts of each model, and warn of those that missing correspondences contradict."""
     with log.stage("check"):
         compared, pairs = _compared(database_path, graph), _pair_rotations(graph)
         found = tuple(weak_cuts(model.reconstruction, pairs, compared) for model in models)
@@ -418,19 +419,19 @@ def _weak_cuts(
                 if cut.contradicted:
                     names = sorted(model.reconstruction.image(i).name for i in cut.images)
                     log.warn(
-                        f"{len(names)} images ({names[0]} to {names[-1]}) are held to the rest of the model by"
-                        f" {cut.num_pairs} of their pairs, but of what both sides should see only {cut.share_seen:.2f}"
-                        f" is seen by both ({cut.share_seen_elsewhere:.2f} elsewhere). They may show another place"
-                        " that looks alike."
+                        f"{len(names)} images ({names[0]} to {names[-1]}) are linked to the rest of the model by only"
+                        f" {cut.num_pairs} of their pairs, and both sides see only a share of {cut.share_seen:.2f} of"
+                        f" the points that both should see ({cut.share_seen_elsewhere:.2f} elsewhere). They may show"
+                        " another place that looks alike."
                     )
-        log.result(f"{sum(map(len, found))} places where few pairs hold a model together")
+        log.result(f"{sum(map(len, found))} weak links within models")
     return found
 
 
 def _as_in_models(
     solution: PoseSolution, graph: ViewGraph, models: Sequence[_Model], cuts: Sequence[Sequence[WeakCut]]
 ) -> PoseSolution:
-    """The solution with the poses, focal lengths and image verdicts of the finished models."""
+    """Update a solution with the poses, focal lengths and image verdicts of the finished models."""
     words = solution.image_verdicts.astype(object)
     words[solution.component >= 0] = ImageVerdict.FEW_OBSERVATIONS
     misplaced = sorted(set().union(*(model.result.misplaced for model in models)))
@@ -475,7 +476,7 @@ def _as_in_models(
 def _covariances_in_models(
     solution: PoseSolution, centers: NDArray[np.float64], component: NDArray[np.int64]
 ) -> NDArray[np.float64] | None:
-    """Covariances of positions, turned and scaled into the frames of the models; NaN for images that came later."""
+    """Position covariances in the frames of the models (n, 3, 3); NaN for images that were registered by points."""
     if solution.position_covariances is None:
         return None
     covariances = np.full_like(solution.position_covariances, np.nan)
@@ -491,7 +492,7 @@ def _covariances_in_models(
 def _focal_scales(
     scales: NDArray[np.float64], graph: ViewGraph, model: "pycolmap.Reconstruction"
 ) -> NDArray[np.float64]:
-    """Factors from the graph's focal lengths to the model's; cameras that are not in the model keep theirs."""
+    """Update the factors on the graph's focal lengths of the cameras that a model uses."""
     scales = scales.copy()
     if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
         used = {model.image(i).camera_id for i in model.reg_image_ids()}

@@ -1,6 +1,6 @@
-"""The output folder: locked and checked before work starts, and given whole models only.
+"""Lock and check the output folder before a job starts, and publish complete models in it.
 
-Models are written under ``OUT/.work`` and renamed to ``OUT/0``, ``OUT/1``, ...: a killed job leaves no half model.
+Models are written under ``OUT/.work`` and renamed to ``OUT/0``, ``OUT/1``, ...; a killed job leaves no partial model.
 """
 
 import errno
@@ -22,23 +22,23 @@ WORK_NAME = ".work"
 LOCK_NAME = "lock"
 STAGE_NAME = "models"
 LOCK_PATIENCE = 3.0
-"""Seconds to wait for another job's lock: a job that was killed may have a process that is about to end."""
+"""Seconds to wait for another job's lock, since a process of a killed job may be about to end."""
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""What file systems that know no locks answer."""
-_held: ContextVar[Mapping[Path, int]] = ContextVar("_held", default={})  # noqa: B039  -- never changed, only replaced
+"""Error numbers of file systems without locks."""
+_held: ContextVar[Mapping[Path, int]] = ContextVar("_held", default={})  # noqa: B039  -- never mutated, only replaced
 _MODEL_NAME = re.compile(r"\d+")
 _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 
 
 def prepare_output(output_path: str | PathLike[str], overwrite: bool = False) -> Path:
-    """Create the output folder and its work folder, and make sure that a model can be written.
+    """Create the output folder and its work folder, and check that a model can be written.
 
     Parameters
     ----------
     output_path : path
         May exist already.
     overwrite : bool
-        Accept a folder that holds models; they stay until `publish_models` replaces them.
+        Accept a folder that holds models; `publish_models` replaces them at the end.
 
     Returns
     -------
@@ -63,22 +63,21 @@ def prepare_output(output_path: str | PathLike[str], overwrite: bool = False) ->
 
 @contextmanager
 def work_folder(output_path: str | PathLike[str], overwrite: bool = False) -> Iterator[Path]:
-    """As :func:`prepare_output`, under the folder's lock: see :func:`output_lock`."""
+    """Lock an output folder and prepare it, as :func:`output_lock` and :func:`prepare_output` do."""
     with output_lock(output_path):
         yield prepare_output(output_path, overwrite)
 
 
 @contextmanager
 def output_lock(output_path: str | PathLike[str]) -> Iterator[None]:
-    """Keep other jobs off an output folder; the kernel lets go of the lock however this process ends.
+    """Lock an output folder against other jobs; the kernel releases the lock however this process ends.
 
-    A job that holds the lock may ask for it again. When the job fails, folders that were made for it and that hold
-    nothing go again.
+    The lock is reentrant. When the job fails, empty folders that were created for it are removed.
 
     Raises
     ------
     OutputError
-        Another job works in the folder, or it cannot be written.
+        Another job is running in the folder, or it cannot be written.
     """
     work = Path(output_path).absolute() / WORK_NAME
     key = work.parent.resolve()
@@ -109,7 +108,7 @@ def lock_descriptors() -> tuple[int, ...]:
 
 
 def _locked_file(path: Path, output_path: str | PathLike[str]) -> int:
-    """Descriptor of the lock file, locked, with this process's number in it."""
+    """Lock the lock file, write this process's id into it, and return its descriptor."""
     deadline = time.monotonic() + LOCK_PATIENCE
     while True:
         try:
@@ -117,8 +116,8 @@ def _locked_file(path: Path, output_path: str | PathLike[str]) -> int:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except FileNotFoundError:
             if time.monotonic() < deadline:
-                continue  # the other job has just removed the folder that it had made
-            raise _not_writable(output_path, "its work folder goes as it is made") from None
+                continue  # the other job has just removed the folder that it had created
+            raise _not_writable(output_path, "its work folder is removed whenever it is created") from None
         except OSError as error:
             raise _not_writable(output_path, error.strerror) from error
         try:
@@ -132,14 +131,14 @@ def _locked_file(path: Path, output_path: str | PathLike[str]) -> int:
                 return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             if time.monotonic() >= deadline:
                 raise OutputError(
-                    f"another job (process {other or 'unknown'}) is at work in {output_path}: wait until it has ended,"
+                    f"another job (process {other or 'unknown'}) is running in {output_path}: wait until it has ended,"
                     " or choose another output_path"
                 ) from error
             time.sleep(0.05)
             continue
-        # The other job may have removed the file between the two steps above: then this is the lock of nothing.
+        # The other job may have removed the file between opening and locking it; then the lock protects nothing.
         if _inode(path) == os.fstat(descriptor).st_ino:
-            with suppress(OSError):  # on a full disk the lock holds without a number
+            with suppress(OSError):  # on a full disk the lock holds without a process id
                 os.ftruncate(descriptor, 0)
                 os.pwrite(descriptor, f"{os.getpid()}\n".encode("ascii"), 0)
             return descriptor
@@ -162,7 +161,7 @@ def refuse_models(output_path: str | PathLike[str], overwrite: bool = False) -> 
     models = existing_models(output_path)
     first = Path(output_path) / "0"
     if first.exists() and first not in models and not (first.is_dir() and not any(first.iterdir())):
-        raise OutputError(f"{first} is there and is no model: move it, or choose another output_path")
+        raise OutputError(f"{first} exists and is not a model: move it, or choose another output_path")
     if models and not overwrite:
         raise OutputError(
             f"{output_path} already holds a model ({models[0]}): choose another output_path, or replace it with "
@@ -171,7 +170,7 @@ def refuse_models(output_path: str | PathLike[str], overwrite: bool = False) -> 
 
 
 def existing_models(output_path: str | PathLike[str]) -> list[Path]:
-    """Folders of models that the output folder holds, itself among them."""
+    """Model folders in the output folder, including the output folder itself if it holds a model."""
     output = Path(output_path)
     if not output.is_dir():
         return []
@@ -181,18 +180,18 @@ def existing_models(output_path: str | PathLike[str]) -> list[Path]:
 
 
 def publish_models(staged: Sequence[Path], output_path: str | PathLike[str]) -> list[Path]:
-    """Rename finished models to ``output_path/0``, ``output_path/1``, ..., in place of those that are there.
+    """Rename finished models to ``output_path/0``, ``output_path/1``, ..., replacing existing ones.
 
     Parameters
     ----------
     staged : sequence of Path
-        Folders of finished models, on the output's own file system.
+        Folders of finished models, on the output folder's file system.
     output_path : path
 
     Returns
     -------
     list of Path
-        The models in their place.
+        The final folders of the models.
 
     Raises
     ------
@@ -213,7 +212,7 @@ def publish_models(staged: Sequence[Path], output_path: str | PathLike[str]) -> 
         with suppress(OSError):
             for source, target in reversed(moved):
                 target.rename(source)
-        raise OutputError(f"cannot put the models into {output}: {error.strerror} ({error.filename})") from error
+        raise OutputError(f"cannot move the models to {output}: {error.strerror} ({error.filename})") from error
     shutil.rmtree(replaced, ignore_errors=True)
     with suppress(OSError):
         (output / WORK_NAME / STAGE_NAME).rmdir()
@@ -221,12 +220,12 @@ def publish_models(staged: Sequence[Path], output_path: str | PathLike[str]) -> 
 
 
 def stage_models(work: Path, num_models: int) -> list[Path]:
-    """Empty folders for models, on the output's own file system; what a killed job left there goes.
+    """Create empty folders for models on the output folder's file system, removing those of a killed job.
 
     Raises
     ------
     OutputError
-        They cannot be made.
+        They cannot be created.
     """
     stage = work / STAGE_NAME
     folders = [stage / str(index) for index in range(num_models)]

@@ -1,4 +1,4 @@
-"""``summary.json``: what a job was asked, what it did, how long it took, and what it left out and why."""
+"""``summary.json``: options, stages, times and results of a job, with the reasons for removed images and pairs."""
 
 import json
 import os
@@ -23,7 +23,7 @@ FILE_NAME = "summary.json"
 def job_summary(
     verb: str, options: Mapping[str, object], records: Sequence[StageRecord], warnings: Sequence[str]
 ) -> dict[str, object]:
-    """The part of the summary that every verb shares: verb, version, options, stages and warnings."""
+    """Entries of the summary that all verbs share: verb, version, options, stages and warnings."""
     return {
         "verb": verb,
         "version": __version__,
@@ -36,7 +36,7 @@ def job_summary(
 
 
 def image_summary(names: Iterable[str], verdicts: Iterable[str], registered: Iterable[bool]) -> dict[str, object]:
-    """Images registered, and those left out with the verdict of each."""
+    """Names of the registered images, and the verdict of each image that is not registered."""
     rows = list(zip(names, verdicts, registered, strict=True))
     left_out = {name: str(verdict) for name, verdict, is_registered in rows if not is_registered}
     return {
@@ -48,7 +48,7 @@ def image_summary(names: Iterable[str], verdicts: Iterable[str], registered: Ite
 
 
 def edge_summary(verdicts: Iterable[str], kept: Iterable[bool]) -> dict[str, object]:
-    """Number of edges kept, and of those dropped by reason."""
+    """Number of kept edges, and of dropped edges by verdict."""
     rows = list(zip(verdicts, kept, strict=True))
     dropped = Counter(str(verdict) for verdict, is_kept in rows if not is_kept)
     return {
@@ -59,8 +59,8 @@ def edge_summary(verdicts: Iterable[str], kept: Iterable[bool]) -> dict[str, obj
 
 
 def model_summary(path: Path, model: "pycolmap.Reconstruction") -> dict[str, object]:
-    """Size and fit of a model."""
-    model.update_point_3d_errors()  # the mean below reads stored errors
+    """Size and mean reprojection error of a model."""
+    model.update_point_3d_errors()  # compute_mean_reprojection_error reads stored errors
     return {
         "path": str(path),
         "num_images": model.num_reg_images(),
@@ -72,7 +72,7 @@ def model_summary(path: Path, model: "pycolmap.Reconstruction") -> dict[str, obj
 
 
 def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
-    """Write ``summary.json``, whole or not at all.
+    """Write ``summary.json`` atomically.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
 
 
 def told_bridges(output_path: Path) -> list[str]:
-    """What the summary of a finished job says of the links between and within its models.
+    """Read the sentences on the links between and within models from the summary of a finished job.
 
     Raises
     ------
@@ -96,11 +96,11 @@ def told_bridges(output_path: Path) -> list[str]:
     except OSError as error:
         raise OutputError(f"cannot read {path}: {error.strerror}; run the job again") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise OutputError(f"{path} is damaged, or of another version: run the job again") from error
+        raise OutputError(f"{path} is damaged or was written by another version: run the job again") from error
 
 
 def plain(value: object) -> object:
-    """The value in JSON's types."""
+    """Convert a value to JSON's types."""
     if is_dataclass(value) and not isinstance(value, type):
         return {name: plain(item) for name, item in asdict(value).items()}
     if isinstance(value, Mapping):

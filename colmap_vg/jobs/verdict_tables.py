@@ -1,7 +1,7 @@
-"""What became of every image and pair, as two CSV tables beside the models, and answers from them.
+"""Tables of the verdicts on all images and pairs, written as CSV files beside the models, and explanations from them.
 
-The tables hold one row per image and per verified pair of the database, with the verdict and how far the pair's own
-relative pose is from that of the finished model.
+The tables hold one row per image and per verified pair of the database, with its verdict and the difference between the
+pair's relative pose and that of the finished model.
 """
 
 import csv
@@ -38,10 +38,10 @@ MAX_PAIRS_SHOWN = 30
 
 @dataclass(frozen=True)
 class ImageRow:
-    """An image of a finished job; `model` is empty where it is in none.
+    """A row of ``images.csv``; `model` is empty for an image that is in no model.
 
-    Deviations are those of the viewing graph's solution, before bundle adjustment, where they were asked for: of the
-    position in percent of the scene's radius (root mean square), of the rotation in degrees.
+    Standard deviations are those of the viewing graph's solution, before bundle adjustment, if covariances were
+    requested: of the position in percent of the scene's radius (root mean square), of the rotation in degrees.
     """
 
     image: str
@@ -55,9 +55,9 @@ class ImageRow:
 
 @dataclass(frozen=True)
 class PairRow:
-    """A verified pair of a finished job; errors are empty where its images do not share a model.
+    """A row of ``pairs.csv``; errors are empty where the pair's images are not in the same model.
 
-    `sigmas` is the error in standard deviations of the pair's own matches.
+    `sigmas` is the error of the relative pose in standard deviations, which follow from the pair's matches.
     """
 
     image1: str
@@ -78,22 +78,22 @@ class VerdictTables:
 
 
 def verdict_tables(graph: ViewGraph, solution: PoseSolution, skipped: Mapping[str, str] | None = None) -> VerdictTables:
-    """Tables of a graph and what was made of it.
+    """Make the tables of a graph and its solution.
 
     Parameters
     ----------
     graph : ViewGraph
     solution : PoseSolution
     skipped : mapping of str to str, optional
-        Files that never became images, with their reasons.
+        Files that were skipped before feature extraction, with the reasons.
     """
     names = image_names(graph)
     count = np.bincount(graph.edges.ravel(), minlength=graph.num_images)
     kept = np.bincount(graph.edges[solution.edge_kept].ravel(), minlength=graph.num_images)
     position, turn = deviations(solution)
     images = [
-        ImageRow(name, str(model) if model >= 0 else "", str(verdict), int(own), int(held), _number(p), _number(t))
-        for name, model, verdict, own, held, p, t in zip(
+        ImageRow(name, str(model) if model >= 0 else "", str(verdict), int(own), int(num_kept), _number(p), _number(t))
+        for name, model, verdict, own, num_kept, p, t in zip(
             names, solution.component.tolist(), solution.image_verdicts, count, kept, position, turn, strict=True
         )
     ]
@@ -115,7 +115,10 @@ def verdict_tables(graph: ViewGraph, solution: PoseSolution, skipped: Mapping[st
 
 
 def deviations(solution: PoseSolution) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Deviations (n,) of positions, percent of their model's radius, and rotations, degrees; NaN where unknown."""
+    """Standard deviations of positions (n,), percent of their model's radius, and of rotations (n,), degrees.
+
+    NaN where they are unknown.
+    """
     if solution.position_covariances is None or solution.rotation_covariances is None:
         unknown = np.full(len(solution.image_ids), np.nan)
         return unknown, unknown
@@ -129,12 +132,12 @@ def deviations(solution: PoseSolution) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def image_names(graph: ViewGraph) -> list[str]:
-    """Names of a graph's images; their ids where it has none."""
+    """Names of a graph's images, or their ids if it has no names."""
     return list(graph.image_names or map(str, graph.image_ids.tolist()))
 
 
 def write_tables(output_path: Path, tables: VerdictTables) -> None:
-    """Write both tables, each whole or not at all.
+    """Write both tables, each atomically.
 
     Raises
     ------
@@ -154,12 +157,12 @@ def write_tables(output_path: Path, tables: VerdictTables) -> None:
 
 
 def read_tables(output_path: Path) -> VerdictTables:
-    """Tables that a finished job left.
+    """Read the tables of a finished job.
 
     Raises
     ------
     DataFileError
-        They are not there, or damaged.
+        A table is missing or damaged.
     """
     images = [
         ImageRow(
@@ -187,12 +190,12 @@ def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
         ) from error
     for number, row in enumerate(rows, start=2):
         if any(row.get(column) is None for column in columns):
-            raise DataFileError(f"{path}, line {number}: not the columns {', '.join(columns)}; run the job again")
+            raise DataFileError(f"{path}, line {number}: lacks the columns {', '.join(columns)}; run the job again")
     return rows
 
 
 def explain_job(tables: VerdictTables, bridges: Sequence[str] = ()) -> list[str]:
-    """Lines on all models, what links them or holds them together, what was left out, and the pairs by verdict."""
+    """List the models, their links, the images that are in no model, and the number of pairs by verdict."""
     models = Counter(row.model for row in tables.images if row.model)
     lines = [
         f"model {model}: {count} images{_agreement(tables, model)}"
@@ -200,7 +203,7 @@ def explain_job(tables: VerdictTables, bridges: Sequence[str] = ()) -> list[str]
     ]
     lines += [f"  {told}" for told in bridges]
     left_out = [row for row in tables.images if not row.model]
-    lines.append(f"left out: {len(left_out)} of {len(tables.images)} images")
+    lines.append(f"not registered: {len(left_out)} of {len(tables.images)} images")
     lines += [f"  {row.image}: {row.verdict} ({image_reason(row.verdict)})" for row in left_out]
     lines.append(f"pairs: {len(tables.pairs)}")
     for verdict, count in Counter(row.verdict for row in tables.pairs).most_common():
@@ -209,21 +212,21 @@ def explain_job(tables: VerdictTables, bridges: Sequence[str] = ()) -> list[str]
 
 
 def explain_image(tables: VerdictTables, name: str) -> list[str]:
-    """Lines on one image and its pairs, the strongest first.
+    """Describe an image and its pairs, those with most inlier matches first.
 
     Raises
     ------
     DataFileError
-        There is no such image.
+        The tables hold no such image.
     """
     row = _image(tables, name)
-    place = f"in model {row.model}" if row.model else "left out"
+    place = f"in model {row.model}" if row.model else "not registered"
     lines = [f"{row.image}: {place}, {row.verdict} ({image_reason(row.verdict)})"]
     lines.append(f"  {row.num_kept_pairs} of its {row.num_pairs} pairs were kept")
     if row.position_sigma_percent:
         lines.append(
-            f"  before bundle adjustment known to {row.position_sigma_percent} % of the scene's radius"
-            f" and {row.rotation_sigma_deg}°"
+            f"  standard deviations before bundle adjustment: position {row.position_sigma_percent} % of the scene's"
+            f" radius, rotation {row.rotation_sigma_deg}°"
         )
     pairs = [pair for pair in tables.pairs if name in (pair.image1, pair.image2)]
     pairs.sort(key=lambda pair: -int(pair.num_inliers or 0))
@@ -236,12 +239,12 @@ def explain_image(tables: VerdictTables, name: str) -> list[str]:
 
 
 def explain_pair(tables: VerdictTables, name1: str, name2: str) -> list[str]:
-    """Lines on a pair and its images.
+    """Describe a pair and its two images.
 
     Raises
     ------
     DataFileError
-        There is no such image.
+        The tables hold no such image.
     """
     images = [_image(tables, name) for name in (name1, name2)]
     found = [pair for pair in tables.pairs if {pair.image1, pair.image2} == {name1, name2}]
@@ -250,17 +253,17 @@ def explain_pair(tables: VerdictTables, name1: str, name2: str) -> list[str]:
     if not found:
         lines = [f"{name1} and {name2}: no verified pair; too few of their features match, or they were not compared"]
     for row in images:
-        lines.append(f"  {row.image}: " + (f"in model {row.model}" if row.model else f"left out, {row.verdict}"))
+        lines.append(f"  {row.image}: " + (f"in model {row.model}" if row.model else f"not registered, {row.verdict}"))
     return lines
 
 
 def image_reason(word: str) -> str:
-    """What a verdict on an image means; a skipped file's word is its own reason."""
+    """Reason of a verdict on an image; for a skipped file the word itself, which is a reason already."""
     return {str(verdict): verdict.reason for verdict in ImageVerdict}.get(word, word)
 
 
 def edge_reason(word: str) -> str:
-    """What a verdict on a pair means."""
+    """Reason of a verdict on a pair."""
     return {str(verdict): verdict.reason for verdict in EdgeVerdict}.get(word, word)
 
 
@@ -274,7 +277,7 @@ def _image(tables: VerdictTables, name: str) -> ImageRow:
 
 
 def _agreement(tables: VerdictTables, model: str) -> str:
-    """Clause on the pairs between a model's images that agree with it."""
+    """Clause on the share of a model's own pairs and inlier matches that agree with it."""
     inside = {row.image for row in tables.images if row.model == model}
     pairs = [p for p in tables.pairs if p.rotation_error_deg and {p.image1, p.image2} <= inside]
     if not pairs:

@@ -1,7 +1,7 @@
-"""From poses to a finished model: triangulation, robust bundle adjustment, registration of what was left, colours.
+"""Build a model from given poses: triangulation, robust bundle adjustment, registration of the remaining images.
 
-The heavy work is pycolmap's. Poses come in nearly right, so one short round of bundle adjustment does where a mapper
-that starts from rough poses needs many.
+pycolmap does the heavy work. The given poses are nearly right, so one short round of bundle adjustment suffices where
+a mapper that starts from rough poses needs many.
 """
 
 from dataclasses import dataclass
@@ -24,31 +24,34 @@ from colmap_vg.mapping.support import supported_observations
 from colmap_vg.options import MappingOptions
 
 MIN_SUPPORTED_OBSERVATIONS = 15
-"""Observations of points seen in three views or more that an image needs to stay: three times what fixes a pose."""
+"""Minimum number of observations, of points seen in three views or more, for an image to stay registered: three times
+what determines a pose."""
 
 MAX_NUM_ROUNDS = 6
-"""Rounds of adjusting and triangulating anew, at most."""
-GOOD_START_COST, SETTLED_COST = 0.5, 0.7
-"""A round that leaves this share of its cost or more is the last: what is left then is noise. In the first round the
-noise of triangulation goes too; two thirds are left where the poses were good, and a third or less where they were not.
-After a good start a second round changed positions by 0.1 to 4 % and never for the better."""
-SETTLED_FOCAL = 0.01
-"""Relative change of a focal length in a round above which another follows, whatever the cost."""
-FOUND_WITH_THE_POSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
-"""Lenses of a focal length and one radial term start well. The others go down a long valley, where these would only
-follow what the photographs hardly tell, as the ratio of two focal lengths."""
+"""Maximum number of rounds of bundle adjustment and retriangulation."""
+GOOD_START_COST_RATIO, CONVERGED_COST_RATIO = 0.5, 0.7
+"""Ratio of final to initial cost of a round at or above which it is the last (first round, later rounds): the remaining
+cost is noise. The first round also removes triangulation noise; its ratio is two thirds where the poses were good, and
+a third or less where they were not. After good poses a second round changed positions by 0.1 to 4 % and never improved
+them."""
+CONVERGED_FOCAL_CHANGE = 0.01
+"""Relative change of a focal length in one round above which another round follows, whatever the cost ratio."""
+WELL_INITIALIZED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
+"""Camera models whose intrinsics are nearly right at the start; changes of their focal lengths cause no further round.
+The parameters of other models start at 0 and converge slowly. Further rounds of these would only change parameters that
+the photographs hardly determine, such as the ratio of two focal lengths."""
 
 
 @dataclass(frozen=True)
 class BuildResult:
-    """What became of the images while the model was built.
+    """Contradictions between the built model and the relative poses of its pairs.
 
     Attributes
     ----------
     misplaced : frozenset of int
-        Ids of images that points would have placed where their pairs contradict it.
+        Ids of images that were registered by their points and removed again because their pairs contradict that pose.
     folded : bool
-        Whether parts are held together by points alone, against what all pairs between them tell.
+        Whether the model has parts that only points link, while all pairs between them contradict it.
     """
 
     misplaced: frozenset[int] = frozenset()
@@ -63,7 +66,7 @@ def build_model(
     others: frozenset[int] = frozenset(),
     pairs: PairRotations | None = None,
 ) -> BuildResult:
-    """Triangulate and adjust a reconstruction of poses, in place, and register what is left.
+    """Triangulate and adjust a reconstruction of poses, in place, and register the remaining images.
 
     Parameters
     ----------
@@ -73,10 +76,10 @@ def build_model(
     options : MappingOptions
     log : StageLog
     others : frozenset of int
-        Ids of images that have a model of their own; they are not registered in this one.
+        Ids of images of other models; they are not registered in this one.
     pairs : PairRotations, optional
-        Images that come by their points leave again where their pairs contradict that; parts of the finished model
-        that no pair confirms are a warning.
+        Relative rotations to check the model against: images registered by their points are removed again where their
+        pairs contradict the pose, and a warning names parts of the finished model that no pair confirms.
 
     Returns
     -------
@@ -94,21 +97,27 @@ def build_model(
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):
         lenses = _focal_lengths(reconstruction)
-        left, enough = _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4), GOOD_START_COST
+        cost_ratio, enough = (
+            _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4),
+            GOOD_START_COST_RATIO,
+        )
         for _ in range(MAX_NUM_ROUNDS):
             before, lenses = lenses, _focal_lengths(reconstruction)
             mapper.complete_and_merge_tracks(triangulator)
             mapper.retriangulate(triangulator)
             _filter(mapper)
-            if left >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= SETTLED_FOCAL:
+            if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
                 break
-            left, enough = _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5), SETTLED_COST
+            cost_ratio, enough = (
+                _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5),
+                CONVERGED_COST_RATIO,
+            )
         else:
-            log.warn(f"Bundle adjustment still lowered its cost after {MAX_NUM_ROUNDS} rounds; the model may be bent.")
+            log.warn(f"Bundle adjustment did not converge in {MAX_NUM_ROUNDS} rounds; the model may be bent.")
         log.result(_state(reconstruction))
     with log.stage("register"):
         removed = _remove_unsupported(mapper)
-        # What left may come back by the points: the graph had it in a wrong place.
+        # A removed image may be registered again by its points: its pose from the view graph was wrong.
         added = _register_left_out(mapper, options, others)
         removed -= added
         misplaced = _remove_misplaced(mapper, added, pairs)
@@ -124,7 +133,7 @@ def build_model(
             cache,
             options,
             log,
-            lambda held: _adjust(mapper, held, max_num_iterations=20, function_tolerance=1e-5),
+            lambda changed: _adjust(mapper, changed, max_num_iterations=20, function_tolerance=1e-5),
         )
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
@@ -133,20 +142,20 @@ def build_model(
 
 
 def _focal_lengths(reconstruction: "pycolmap.Reconstruction") -> NDArray[np.float64]:
-    """Mean focal lengths of the cameras that start without some of their parameters, pixels."""
+    """Mean focal lengths of the cameras whose model is not in `WELL_INITIALIZED_MODELS`, pixels."""
     lenses = [lens for _, lens in sorted(reconstruction.cameras.items())]
-    return np.array([lens.mean_focal_length() for lens in lenses if lens.model_name not in FOUND_WITH_THE_POSES])
+    return np.array([lens.mean_focal_length() for lens in lenses if lens.model_name not in WELL_INITIALIZED_MODELS])
 
 
 def adjust_once_more(
     cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", options: MappingOptions
 ) -> float:
-    """One more round of bundle adjustment on a finished model, in place.
+    """Run one more round of bundle adjustment on a finished model, in place.
 
     Returns
     -------
     float
-        The share of its cost that the round left.
+        Ratio of the final to the initial cost.
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
@@ -159,12 +168,12 @@ def adjust_once_more(
 def _adjust(
     mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, max_num_iterations: int, function_tolerance: float
 ) -> float:
-    """One round of bundle adjustment, then the filter; the share of its cost that the round left."""
-    left = adjust_bundle(
+    """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
+    cost_ratio = adjust_bundle(
         mapper.reconstruction, options, max_num_iterations=max_num_iterations, function_tolerance=function_tolerance
     )
     _filter(mapper)
-    return left
+    return cost_ratio
 
 
 def _filter(mapper: "pycolmap.IncrementalMapper") -> None:
@@ -173,7 +182,7 @@ def _filter(mapper: "pycolmap.IncrementalMapper") -> None:
 
 
 def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
-    """Deregister images that too few well-triangulated points fix, weakest first, until all that stay are fixed."""
+    """Deregister images with too few observations of well-triangulated points, weakest first; return their ids."""
     reconstruction = mapper.reconstruction
     removed: set[int] = set()
     while True:
@@ -189,7 +198,7 @@ def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
 def _register_left_out(
     mapper: "pycolmap.IncrementalMapper", options: MappingOptions, never: frozenset[int]
 ) -> set[int]:
-    """Register images by PnP against the points, best first, until no more can be."""
+    """Register images by PnP against the points, best first, until none can be added; return their ids."""
     registration, triangulator = mapper_options(options), triangulator_options(options)
     added: set[int] = set()
     while True:
@@ -204,7 +213,7 @@ def _register_left_out(
 
 
 def _remove_misplaced(mapper: "pycolmap.IncrementalMapper", added: set[int], pairs: PairRotations | None) -> set[int]:
-    """Deregister those of the images that came by their points whose pairs tell another rotation."""
+    """Deregister images added by PnP whose pairs contradict their rotation; return their ids."""
     if pairs is None or not added:
         return set()
     misplaced = added & pair_agreement(mapper.reconstruction, pairs).contradicted
@@ -214,19 +223,19 @@ def _remove_misplaced(mapper: "pycolmap.IncrementalMapper", added: set[int], pai
 
 
 def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotations | None, log: StageLog) -> bool:
-    """Warn of parts and images that their pairs contradict; whether there are such parts."""
+    """Warn of parts and images that their pairs contradict; return whether there are such parts."""
     if pairs is None:
         return False
     found = pair_agreement(reconstruction, pairs)
     for part in found.detached:
         names = sorted(reconstruction.image(i).name for i in part)
         log.warn(
-            f"{len(names)} images ({names[0]} to {names[-1]}) are held to the rest of the model by points alone: all"
-            " pairs between them tell other rotations. The model may be folded there."
+            f"{len(names)} images ({names[0]} to {names[-1]}) are linked to the rest of the model by points only: all"
+            " pairs between them contradict its rotations. The model may be folded there."
         )
     if found.contradicted:
         names = sorted(reconstruction.image(i).name for i in found.contradicted)
-        log.warn(f"The pairs of {len(names)} images tell other rotations than the model (first: {names[0]}).")
+        log.warn(f"The model's rotations of {len(names)} images contradict their pairs (first: {names[0]}).")
     return len(found.detached) > 0
 
 

@@ -1,6 +1,7 @@
-"""One round of bundle adjustment, with a loss for the noise that the keypoints show.
+"""One round of bundle adjustment, with a robust loss scaled to the keypoint noise of the images.
 
-Tracks of three views or more adjust the cameras: two views fix none, and pull it away. Points of two views then follow.
+Only tracks of three views or more adjust the cameras, since tracks of two views do not determine a pose and bias it.
+Points of two views are refined afterwards with the cameras fixed.
 """
 
 import numpy as np
@@ -14,7 +15,8 @@ from colmap_vg.mapping.point_refinement import refine_points
 from colmap_vg.options import MappingOptions
 
 RAYLEIGH_MEAN, MIN_SIGMA_PX, MAX_SCALE_PX = 1.2533, 0.1, 1.0
-"""Mean length of two normal deviates of deviation 1; keypoints are no better than a tenth of a pixel."""
+"""Mean norm of a 2-vector of standard normal deviates, dimensionless; minimum keypoint noise, pixels; maximum scale of
+the loss, pixels."""
 
 
 def adjust_bundle(
@@ -32,12 +34,12 @@ def adjust_bundle(
     options : MappingOptions
     max_num_iterations : int
     function_tolerance : float
-        On the relative change of the cost.
+        Relative change of the cost at which the solver stops.
 
     Returns
     -------
     float
-        The share of its cost that the adjustment left; 1 where there was nothing to adjust by.
+        Ratio of the final to the initial cost; 1 without observations.
     """
     scale = _loss_scale(reconstruction)
     bundle = bundle_options(
@@ -52,16 +54,16 @@ def adjust_bundle(
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     summary = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
     _move_short_tracks(reconstruction, scale)
-    # Without an observation to adjust by there is no such summary.
+    # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
 
 
 def _loss_scale(reconstruction: "pycolmap.Reconstruction") -> float:
-    """Cauchy scale for the noise that the keypoints show, pixels.
+    """Cauchy scale from the median reprojection error, pixels.
 
-    A pixel is a lot for sharp photographs: half of it lowered their cameras' errors by up to a fifth. More than a pixel
-    is no noise of keypoints but that of a poor start.
+    A scale of 1 pixel is too large for sharp photographs: half a pixel lowered their cameras' errors by up to a fifth.
+    Errors above 1 pixel come from poor initial poses, not from keypoint noise.
     """
     reconstruction.update_point_3d_errors()
     errors = np.array([point.error for point in reconstruction.points3D.values()])
@@ -70,7 +72,7 @@ def _loss_scale(reconstruction: "pycolmap.Reconstruction") -> float:
 
 
 def _move_short_tracks(reconstruction: "pycolmap.Reconstruction", scale_px: float) -> None:
-    """Points that did not adjust the cameras, moved to where these now see them."""
+    """Refine the points whose tracks were too short to adjust the cameras, with the cameras fixed."""
     short = [(i, p) for i, p in sorted(reconstruction.points3D.items()) if p.track.length() < MIN_TRACK_LENGTH]
     if not short:
         return
@@ -83,7 +85,7 @@ def _move_short_tracks(reconstruction: "pycolmap.Reconstruction", scale_px: floa
     rays, focal = np.zeros((len(elements), 3)), np.zeros(len(elements))
     for camera_id in np.unique(camera_ids).tolist():
         camera, own = reconstruction.camera(camera_id), camera_ids == camera_id
-        # Keypoints without a ray are NaN, and leave their points where they are.
+        # Keypoints that cannot be undistorted have NaN rays; their points do not move.
         rays[own] = normalized(np.concatenate([camera.cam_from_img(keypoints[own]), np.ones((own.sum(), 1))], axis=1))
         focal[own] = camera.mean_focal_length()
     world_from_cam = np.array([image.cam_from_world().rotation.matrix().T for image in images])

@@ -1,4 +1,4 @@
-"""Colours of points: the mean over the photographs that see each."""
+"""Colours of points: the mean over the images that observe each point."""
 
 from os import PathLike
 from pathlib import Path
@@ -16,20 +16,23 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MAX_ASPECT_CHANGE = 0.01
-"""Between a photograph and a smaller copy of it, whose sides are rounded; a file further off is another picture."""
+"""Maximum relative change of aspect ratio between a photograph and a resized copy, whose sides are rounded to pixels; a
+file beyond it is a different picture."""
 
 
 def extract_colors(
     reconstruction: "pycolmap.Reconstruction", image_path: str | PathLike[str] | None, log: StageLog
 ) -> None:
-    """Give points the mean colour of their images, smaller copies of them too; a caveat names images without.
+    """Set the colour of each point to the mean over its images, and warn of images that cannot be used.
+
+    The files may be resized copies of the images.
 
     Parameters
     ----------
     reconstruction : pycolmap.Reconstruction
-        Its points' colours are set.
+        Modified in place.
     image_path : path or None
-        Folder of the photographs; None leaves all points black.
+        Folder of the images; with None all points stay black.
     log : StageLog
     """
     if image_path is None:
@@ -55,26 +58,26 @@ def extract_colors(
         seen_colors = interpolated(pixels, np.array([point.xy for point in seen]).reshape(-1, 2) * scale)
         total[rows] += seen_colors[:, ::-1]
         count[rows] += 1.0
-    _warn(missing, f"are not in {folder}, or cannot be read", reconstruction, log)
-    _warn(unlike, f"have other proportions than the files in {folder}", reconstruction, log)
+    _warn(missing, f"are missing in {folder} or cannot be read", reconstruction, log)
+    _warn(unlike, f"differ in aspect ratio from the files in {folder}", reconstruction, log)
     colors = np.round(total / np.maximum(count, 1.0)[:, None]).astype(np.uint8)
     for point_id, color in zip(ids.tolist(), colors, strict=True):
         reconstruction.point3D(point_id).color = color
 
 
 def interpolated(pixels: NDArray[np.uint8], points: Array) -> Array:
-    """Colours between pixels, by bilinear interpolation.
+    """Interpolate the colours of a picture bilinearly at points.
 
     Parameters
     ----------
     pixels : (h, w, 3) uint8 array
     points : (n, 2) array
-        Pixels, as COLMAP counts: the first one's centre is at (0.5, 0.5).
+        Pixels, in COLMAP's convention: the centre of the first pixel is at (0.5, 0.5).
 
     Returns
     -------
     (n, 3) array
-        Outside of the picture, those of its border.
+        Points outside of the picture get the colour of its border.
     """
     height, width = pixels.shape[:2]
     at = np.clip(points - 0.5, 0.0, np.array([width - 1.0, height - 1.0]))
@@ -86,7 +89,7 @@ def interpolated(pixels: NDArray[np.uint8], points: Array) -> Array:
 
 
 def _read(path: Path) -> NDArray[np.uint8] | None:
-    """Blue, green and red as stored, before any EXIF orientation; None where there is no picture."""
+    """Read a picture as blue, green and red, without applying the EXIF orientation; None where it cannot be read."""
     try:
         pixels = decoded(path.read_bytes())
     except OSError:
@@ -103,5 +106,5 @@ def _warn(names: list[str], why: str, reconstruction: "pycolmap.Reconstruction",
     if names:
         log.warn(
             f"{len(names)} of {reconstruction.num_reg_images()} registered images {why} (first: {min(names)}); points"
-            " seen only there stay black."
+            " observed only in them stay black."
         )

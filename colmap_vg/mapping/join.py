@@ -1,4 +1,4 @@
-"""Models that share points are parts of one: the similarity between them, and the poses of both in one frame."""
+"""Join two models that share points: estimate the similarity between them, and transform both into one frame."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,24 +16,27 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MIN_AGREEING = 10
-"""Points that agree on a similarity in both images; three fix it, and one does so by chance in 10^4."""
+"""Minimum number of points that agree with the similarity in both models; three determine it, and a wrong point agrees
+by chance once in 10^4."""
 MIN_SHARE_AGREEING = 0.5
-"""Of the points that both models have; where another half says otherwise, neither is believed."""
+"""Minimum share of the shared points that agree: with fewer, another similarity may have as many."""
 MIN_FLATNESS = 0.05
-"""Second over first singular value of the points that agree: those along a line leave a turn about it."""
+"""Minimum ratio of the second to the first singular value of the points that agree: collinear points do not determine
+the rotation about their line."""
 NO_POINT = np.iinfo(np.uint64).max
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What the points that two models share say of joining them.
+    """Similarity between two models and its support.
 
     Attributes
     ----------
     num_shared, num_agreeing : int
-        Points that verified matches identify, and those that agree on one similarity.
+        Number of point pairs that verified matches identify as the same point, and of those that agree with the
+        similarity.
     similarity : Similarity or None
-        From the second model's frame to the first's, where it is firm.
+        From the second model's frame to the first's; None where too few points agree.
     """
 
     num_shared: int
@@ -48,7 +51,7 @@ def joint_of(
     usable: BoolArray,
     seed: int = 0,
 ) -> Joint:
-    """Find the similarity between two models from the points that verified matches identify.
+    """Estimate the similarity between two models from points that verified matches identify as the same.
 
     Parameters
     ----------
@@ -57,7 +60,7 @@ def joint_of(
     graph : ViewGraph
         With the keypoints of the matches of all pairs.
     usable : (m,) bool array
-        Edges of the graph whose matches may identify points.
+        Edges of the graph whose matches are used.
     seed : int
 
     Returns
@@ -86,16 +89,16 @@ def joined_poses(
     other: "pycolmap.Reconstruction",
     similarity: Similarity,
 ) -> "pycolmap.Reconstruction":
-    """Both models' cameras and poses in the frame of the first, without points.
+    """Collect both models' cameras and poses in the frame of the first, without points.
 
     Parameters
     ----------
     empty : pycolmap.Reconstruction
         With all images of the database, none registered; it is filled in place.
     own, other : pycolmap.Reconstruction
-        Cameras of both have the first one's parameters.
+        Cameras in both models get the parameters of the first.
     similarity : Similarity
-        From the second one's frame to the first's.
+        From the second model's frame to the first's.
     """
     for model in (other, own):
         for camera_id in sorted({model.image(i).camera_id for i in model.reg_image_ids()}):
@@ -116,7 +119,7 @@ def joined_poses(
 
 
 def is_spread(points: Array) -> bool:
-    """Whether points (k, 3) fix a similarity: they are not along one line."""
+    """Whether points (k, 3) determine a similarity, that is, are not collinear."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(singular[1] >= MIN_FLATNESS * singular[0])
 
@@ -124,7 +127,10 @@ def is_spread(points: Array) -> bool:
 def _identified(
     own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction", graph: ViewGraph, usable: BoolArray
 ) -> Iterator[IntArray]:
-    """Rows (point of own, of other, image of own, of other, keypoint in it, in the other) of each pair between them."""
+    """For each pair between the models, rows of the ids of two identified points, their images, and their keypoints.
+
+    The columns are: point in own, point in other, image in own, image in other, keypoint in own, keypoint in other.
+    """
     offsets, keypoints1, keypoints2 = graph.inlier_offsets, graph.inlier_keypoints1, graph.inlier_keypoints2
     if offsets is None or keypoints1 is None or keypoints2 is None:
         return

@@ -1,4 +1,4 @@
-"""Distortion coefficients that the images do not determine, and that diverged in bundle adjustment."""
+"""Reset distortion coefficients that the images do not determine and that diverged in bundle adjustment."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,9 +9,10 @@ from colmap_vg.events import StageLog
 from colmap_vg.options import MappingOptions
 
 MAX_SANE_COEFFICIENT = 10.0
-"""Of a lens's distortion, in COLMAP's models; those of real lenses stay far below."""
+"""Distortion coefficient, in the units of COLMAP's camera models, above which it has diverged; real lenses stay far
+below."""
 MAX_ASPECT = 1.01
-"""Of focal lengths in x and y that a simpler model may hold equal."""
+"""Maximum ratio of the focal lengths in x and y for a camera model with a single one."""
 
 _SIMPLER: dict[str, tuple[str, tuple[tuple[int, ...], ...]]] = {
     "FULL_OPENCV": ("OPENCV", ((0,), (1,), (2,), (3,), (4,), (5,), (6,), (7,))),
@@ -19,7 +20,8 @@ _SIMPLER: dict[str, tuple[str, tuple[tuple[int, ...], ...]]] = {
     "THIN_PRISM_FISHEYE": ("RADIAL_FISHEYE", ((0, 1), (2,), (3,), (4,), (5,))),
     "RAD_TAN_THIN_PRISM_FISHEYE": ("RADIAL_FISHEYE", ((0, 1), (2,), (3,), (4,), (5,))),
 }
-"""The same model with fewer coefficients, and which of the full model's parameters each of its own is."""
+"""For each camera model, a model with fewer coefficients, and for each of its parameters the indices of the full
+model's parameters that it stands for."""
 
 
 def reset_diverged_lenses(
@@ -29,10 +31,10 @@ def reset_diverged_lenses(
     log: StageLog,
     adjust: Callable[[MappingOptions], object],
 ) -> None:
-    """Reset distortion coefficients that diverged, adjust again, and warn of them.
+    """Reset distortion coefficients that diverged, repeat bundle adjustment, and warn of them.
 
-    Given coefficients are reset to their initial values. Lenses that started without distortion are adjusted under a
-    simpler model, and get their own model back afterwards, with its higher coefficients 0.
+    Coefficients given at the start are reset to their initial values. Cameras that started without distortion are
+    adjusted with a simpler model, then get their own model back with its higher coefficients set to 0.
 
     Parameters
     ----------
@@ -43,38 +45,38 @@ def reset_diverged_lenses(
     options : MappingOptions
     log : StageLog
     adjust : callable
-        Bundle adjustment of the reconstruction under options.
+        Runs bundle adjustment of the reconstruction with the given options.
     """
     diverged = _diverged(reconstruction) if options.ba_refine_extra_params else []
     given = [i for i in diverged if any(cache.camera(i).params[k] for k in cache.camera(i).extra_params_idxs())]
     simple = [i for i in diverged if i not in given and _has_simpler_model(reconstruction.camera(i))]
     if simple:
-        told = _coefficients(reconstruction, simple)
-        log.warn(f"The images do not determine the higher ones of {told}; they are set to 0.")
+        coefficients = _coefficients(reconstruction, simple)
+        log.warn(f"The images do not determine the higher-order terms of {coefficients}; they are set to 0.")
         models = [_simplify(reconstruction.camera(i)) for i in simple]
         adjust(options)
         for camera_id, (model, size) in zip(simple, models, strict=True):
             _restore(reconstruction.camera(camera_id), model, size)
-    # Last: no coefficient is refined any more.
+    # This comes last because bundle adjustment then refines no coefficients at all.
     for camera_id in given:
         lens, initial = reconstruction.camera(camera_id), cache.camera(camera_id).params
         lens.params = [initial[k] if k in lens.extra_params_idxs() else p for k, p in enumerate(lens.params)]
     if given:
-        told = _coefficients(reconstruction, given)
-        log.warn(f"The images do not determine {told}; they are kept at their initial values.")
+        coefficients = _coefficients(reconstruction, given)
+        log.warn(f"The images do not determine {coefficients}; they are kept at their initial values.")
         adjust(replace(options, ba_refine_extra_params=False))
     _warn_of_diverged(reconstruction, log)
 
 
 def _warn_of_diverged(reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
-    """Warn of lenses whose coefficients are no real lens's."""
+    """Warn of cameras whose distortion coefficients diverged."""
     diverged = _diverged(reconstruction)
     if diverged:
         largest = max(_largest_coefficient(reconstruction.camera(i)) for i in diverged)
         log.warn(
             f"The images do not determine {_coefficients(reconstruction, diverged)}, which reach {largest:.3g}: the"
-            " lens is valid inside the images only. Choose a camera model with fewer coefficients, or do not refine"
-            " them (ba_refine_extra_params)."
+            " calibration is valid inside the images only. Choose a camera model with fewer coefficients, or do not"
+            " refine them (ba_refine_extra_params)."
         )
 
 
@@ -86,7 +88,7 @@ def _has_simpler_model(lens: "pycolmap.Camera") -> bool:
 
 
 def _simplify(lens: "pycolmap.Camera") -> tuple[str, int]:
-    """Give a camera its simpler model, without distortion; its own model, and how many parameters that has."""
+    """Set a camera to its simpler model, without distortion; return its own model and the number of its parameters."""
     own, params = lens.model_name, lens.params
     name, rows = _SIMPLER[own]
     undistorted = pycolmap.Camera(model=name, width=lens.width, height=lens.height, params=[0.0] * len(rows))
@@ -97,14 +99,14 @@ def _simplify(lens: "pycolmap.Camera") -> tuple[str, int]:
 
 
 def _restore(lens: "pycolmap.Camera", own: str, size: int) -> None:
-    """Give a camera its own model again; coefficients that the simpler one does not have are 0."""
+    """Set a camera back to its own model; coefficients that the simpler model lacks are 0."""
     _, rows = _SIMPLER[own]
     found = {k: value for value, same in zip(lens.params, rows, strict=True) for k in same}
     lens.model, lens.params = getattr(pycolmap.CameraModelId, own), [found.get(k, 0.0) for k in range(size)]
 
 
 def _diverged(reconstruction: "pycolmap.Reconstruction") -> list[int]:
-    """Ids of cameras of registered images whose coefficients are no real lens's."""
+    """Ids of the cameras of registered images whose distortion coefficients diverged."""
     used = sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()})
     return [i for i in used if _largest_coefficient(reconstruction.camera(i)) > MAX_SANE_COEFFICIENT]
 

@@ -1,4 +1,4 @@
-"""pycolmap's option objects for each step, from ours."""
+"""pycolmap's option objects for each mapping step, made from `MappingOptions`."""
 
 import pycolmap
 
@@ -6,15 +6,15 @@ from colmap_vg.options import MappingOptions
 
 MAX_REPROJECTION_PX = 4.0
 MIN_TRIANGULATION_ANGLE_DEG = 1.5
-"""COLMAP's own thresholds for points."""
+"""COLMAP's default thresholds for triangulated points: reprojection error in pixels, angle in degrees."""
 MAX_EXTRA_PARAM = 1e6
-"""COLMAP leaves out cameras with a distortion parameter above 1, which some models rightly have (EUCM's beta)."""
+"""Maximum distortion parameter; COLMAP's default of 1 rejects cameras whose model may exceed it (EUCM's beta)."""
 MIN_TRACK_LENGTH = 3
-"""Of points that adjust cameras."""
+"""Minimum number of views of points that adjust the cameras."""
 
 
 def triangulator_options(options: MappingOptions) -> "pycolmap.IncrementalTriangulatorOptions":
-    """Thresholds of COLMAP, with the job's seed."""
+    """Triangulation options: COLMAP's thresholds, with the given random seed."""
     return pycolmap.IncrementalTriangulatorOptions(
         min_angle=MIN_TRIANGULATION_ANGLE_DEG,
         complete_max_reproj_error=MAX_REPROJECTION_PX,
@@ -25,7 +25,7 @@ def triangulator_options(options: MappingOptions) -> "pycolmap.IncrementalTriang
 
 
 def mapper_options(options: MappingOptions) -> "pycolmap.IncrementalMapperOptions":
-    """Registration and filtering as in COLMAP, with our switches for intrinsics."""
+    """Registration and filtering options: COLMAP's thresholds, with the given choice of intrinsics to refine."""
     return pycolmap.IncrementalMapperOptions(
         abs_pose_refine_focal_length=options.ba_refine_focal_length,
         abs_pose_refine_extra_params=options.ba_refine_extra_params,
@@ -40,10 +40,10 @@ def mapper_options(options: MappingOptions) -> "pycolmap.IncrementalMapperOption
 def bundle_options(
     options: MappingOptions, *, loss_scale_px: float, max_num_iterations: int, function_tolerance: float
 ) -> "pycolmap.BundleAdjustmentOptions":
-    """Bundle adjustment with a Cauchy loss: Huber ends worse.
+    """Bundle adjustment options, with a Cauchy loss, which gave better results than Huber's.
 
-    The trust region is wide from the start. Poses come nearly right, and what a narrow one holds back is what the
-    points fix least: the bend of a long street took three times the steps.
+    The initial trust region is wide since the poses are nearly right. A narrow one slows the directions that the
+    points determine least: the bend of a long street took three times as many steps.
     """
     bundle = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=options.ba_refine_focal_length,

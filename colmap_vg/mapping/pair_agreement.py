@@ -1,6 +1,7 @@
-"""A finished model against the relative poses of its pairs: images that points alone hold, and parts that fold.
+"""Compare the rotations of a finished model with those of its pairs, to find misplaced images and folded parts.
 
-Points can tie an image to a look-alike of what it shows; its pairs' two-view geometries then tell another rotation.
+Points can register an image at a look-alike of what it shows; the two-view geometries of its pairs then contradict
+the rotation.
 """
 
 from dataclasses import dataclass
@@ -17,14 +18,15 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MAX_ROTATION_DEG = 15.0
-"""Of a pair against the model; the noise of weak true pairs was seen to reach ten."""
+"""Maximum angle, degrees, between a pair's relative rotation and the model's; that of weak correct pairs reached 10."""
 MIN_CONTRADICTING, MIN_PART_IMAGES = 3, 3
-"""Pairs that contradict an image, for one or two weak ones are often wrong themselves; images of a part."""
+"""Minimum number of pairs that contradict an image, since one or two weak ones are often wrong themselves; minimum
+number of images of a part."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairRotations:
-    """Relative rotations of pairs with a pose of their own.
+    """Relative rotations of the pairs whose matches determine one.
 
     Attributes
     ----------
@@ -40,12 +42,12 @@ class PairRotations:
 
 @dataclass(frozen=True)
 class PairAgreement:
-    """What the pairs say of a model.
+    """Images and parts of a model that its pairs contradict or do not link.
 
     Attributes
     ----------
     contradicted : frozenset of int
-        Ids of images of which three pairs or more, by more than half of the matches, tell another rotation.
+        Ids of images whose rotation three pairs or more contradict, with more than half of the image's matches.
     detached : tuple of frozenset of int
         Parts of three images or more that no agreeing pair links to the largest part.
     """
@@ -78,7 +80,7 @@ def pair_agreement(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
 def agreeing_pairs(
     reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, pairs: PairRotations
 ) -> tuple[IntArray, Array]:
-    """Pairs (m, 2) of rows of `image_ids`, rising, that agree with a model, and their numbers of matches (m,)."""
+    """Pairs (m, 2) of rows of the ascending `image_ids` that agree with a model, and their numbers of matches (m,)."""
     edges, matches, agree = _compared(reconstruction, image_ids, pairs)
     return edges[agree], matches[agree]
 
@@ -96,7 +98,7 @@ def _compared(
 
 
 def _detached(ids: IntArray, edges: IntArray, with_pairs: IntArray) -> tuple[frozenset[int], ...]:
-    """Parts besides the largest of the graph of agreeing pairs; images without any pair are none."""
+    """Components of the graph of agreeing pairs, without the largest, small ones, and images without any pair."""
     part = components_by_size(len(ids), edges)[with_pairs]
     largest = part.min(initial=0)
     sizes = np.bincount(part)

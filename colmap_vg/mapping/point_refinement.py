@@ -1,8 +1,8 @@
-"""Points at the minimum of their reprojection errors while the cameras stand still: all points at once.
+"""Refine points by minimising their reprojection errors with fixed cameras, all points at once.
 
-In the plane that touches the unit sphere at the observed ray ``u``, ``v = X - c`` is off by ``f B^T v / |v|`` pixels,
-``B = tangent_basis(u)``: the reprojection error, of any lens, to first order. Damped Gauss-Newton steps under the
-Cauchy loss of the bundle adjustment, each point with its own 3 x 3 system.
+The residual of a point ``X`` seen from ``c`` along the unit ray ``u`` is ``f B^T v / |v|`` pixels, with ``v = X - c``
+and ``B = tangent_basis(u)``: to first order the reprojection error of any camera model. Damped Gauss-Newton steps
+minimise the bundle adjustment's Cauchy loss, with one 3 x 3 system per point.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 DAMPING = 1e-6
-"""Share of the mean curvature added to all: a point whose rays are parallel stays where it is along them."""
+"""Damping, as a share of the Hessian's mean eigenvalue: a point whose rays are parallel does not move along them."""
 
 
 def refine_points(
@@ -29,28 +29,28 @@ def refine_points(
     scale_px: float = 1.0,
     num_iterations: int = 3,
 ) -> Array:
-    """Positions of points after steps that lower their robust reprojection errors.
+    """Refine positions of points by Gauss-Newton steps on their robust reprojection errors.
 
     Parameters
     ----------
     positions : (q, 3) array
-        To start from, world frame.
+        Initial positions, world frame.
     point_row : (k,) int64 array
         Point of each observation.
     rays_world : (k, 3) array
-        Unit rays of the observed keypoints.
+        Unit rays of the observed keypoints, world frame.
     centers : (k, 3) array
-        Projection centre of each observation's camera.
+        Projection centre of each observation's camera, world frame.
     focal_lengths : (k,) array
         Pixels.
     scale_px : float
-        Cauchy scale.
+        Cauchy scale, pixels.
     num_iterations : int
 
     Returns
     -------
     (q, 3) array
-        A point that no step made better is where it was.
+        Refined positions, world frame; the initial one where no step lowered the cost.
     """
     q = len(positions)
     across = focal_lengths[:, None, None] * np.swapaxes(tangent_basis(rays_world), 1, 2)

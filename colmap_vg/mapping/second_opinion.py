@@ -1,8 +1,8 @@
-"""What points say of poses that the viewing graph leaves in doubt: is what should be seen there seen?
+"""Choose between arrangements of the images by missing correspondences: the points that images should see but do not.
 
-Where a fold lays one part of a scene over another that looks alike, its points fit as well as those of the right model.
-But images that now stand side by side should see the same points, and see them only where the parts are alike
-(missing correspondences: Zach et al., CVPR 2008; Jiang et al., CVPR 2012).
+Where a folded model lays one part of a scene over another that looks alike, its points fit as well as those of the
+correct model. But images that are then side by side should see the same points, and see them only where the parts are
+alike (missing correspondences: Zach et al., CVPR 2008; Jiang et al., CVPR 2012).
 """
 
 from collections.abc import Sequence
@@ -21,23 +21,23 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 CLEARLY_MORE, MIN_SHARE_EXPLAINED = 1.2, 0.8
-"""Share of what should be seen that is, over that in another arrangement of the images, which settles between them: 1.5
-to 2.5 where one was folded and part of the scene did not repeat itself, 1.0 between two folds. An arrangement whose
-points explain much fewer observations than another's does not count."""
+"""Minimum ratio of one arrangement's share of expected observations that exist to another's, to prefer it: measured 1.5
+to 2.5 where the other was folded and part of the scene did not repeat itself, 1.0 between two folds. Minimum number of
+observations of an arrangement, as a share of the largest; one with fewer is not considered."""
 
 
 @dataclass(frozen=True)
 class PointEvidence:
-    """What the points of a model explain.
+    """Numbers of observations of a model that exist and that should exist.
 
     Attributes
     ----------
     num_observations : int
         Observations of points that three images or more see.
     num_expected : int
-        Of the points looked for, pairs of point and image in which the point should be seen.
+        Expected observations: pairs of a sampled point and an image that should see it.
     num_seen : int
-        Those in which it is.
+        Expected observations that exist.
     """
 
     num_observations: int
@@ -46,14 +46,14 @@ class PointEvidence:
 
     @property
     def share_seen(self) -> float:
-        """Share of what should be seen that is."""
+        """Share of the expected observations that exist; 0 without any."""
         return self.num_seen / self.num_expected if self.num_expected else 0.0
 
 
 def point_evidence(
     cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", options: MappingOptions
 ) -> PointEvidence:
-    """Triangulate a reconstruction of poses, in place, and count what its points explain.
+    """Triangulate a reconstruction of poses, in place, and count its expected and existing observations.
 
     Parameters
     ----------
@@ -85,18 +85,18 @@ def point_evidence(
 
 
 def best_arrangement(found: Sequence[PointEvidence]) -> tuple[int, bool]:
-    """The arrangement that points speak for, and whether they settle it.
+    """Choose the arrangement with the largest share of expected observations that exist.
 
     Parameters
     ----------
     found : sequence of PointEvidence
-        Of two arrangements or more; the first is the one that pairs prefer, and stays where points are not clear.
+        Of two arrangements or more; the first is the one that pairs prefer, chosen unless another is clearly better.
 
     Returns
     -------
     best : int
     settled : bool
-        Whether clearly more of what should be seen is seen in it than in every other one. Never where nothing is.
+        Whether its share is at least `CLEARLY_MORE` times that of every other one, and above 0.
     """
     most = max(evidence.num_observations for evidence in found)
     shares = [e.share_seen if e.num_observations >= MIN_SHARE_EXPLAINED * most else 0.0 for e in found]
@@ -108,7 +108,7 @@ def best_arrangement(found: Sequence[PointEvidence]) -> tuple[int, bool]:
 
 
 def _seen_from_near(xyz: Array, centers: Array, sees: BoolArray) -> BoolArray:
-    """Images (k, n) from whose place another one that sees the point looks at it from nearly the same side."""
+    """Whether another image that sees the point has a viewing angle within `NEAR_DEG` of this image's, (k, n)."""
     near = np.zeros(sees.shape, dtype=bool)
     least = np.cos(np.radians(NEAR_DEG))
     for row, point in enumerate(xyz):

@@ -1,4 +1,4 @@
-"""How many observations really fix each image: those of points that three views see at an angle."""
+"""Count the observations that determine each image's pose: those of points that three views see at an angle."""
 
 from itertools import chain
 
@@ -12,15 +12,15 @@ Array = NDArray[np.float64]
 def supported_observations(
     reconstruction: "pycolmap.Reconstruction", min_angle_deg: float, min_track_length: int = 3
 ) -> dict[int, int]:
-    """Observations of each registered image of well-triangulated points.
+    """Count each registered image's observations of well-triangulated points.
 
     Parameters
     ----------
     reconstruction : pycolmap.Reconstruction
     min_angle_deg : float
-        Degrees; a point counts when two rays of its track meet at this angle or more.
+        Minimum triangulation angle of a point, degrees.
     min_track_length : int
-        Views.
+        Minimum number of views of a point.
 
     Returns
     -------
@@ -49,9 +49,9 @@ def supported_observations(
 
 
 def _widest_angles(rays: Array, offsets: NDArray[np.int64]) -> Array:
-    """For each point at least half of the widest angle between two of its rays, and never more than it, radians.
+    """Approximate the widest angle between two rays of each point, radians: between half of it and the whole.
 
-    The farthest ray from any one ray, then the farthest from that one: two passes in place of all pairs.
+    Instead of comparing all pairs, two passes find the ray farthest from an arbitrary one, and the farthest from that.
     """
     point = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     reference = rays[offsets[:-1]]

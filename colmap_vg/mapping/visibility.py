@@ -1,4 +1,4 @@
-"""Which points of a model lie in the frames of which images, and which images see them."""
+"""Visibility of a model's points: which images observe them, and into which images they project."""
 
 from dataclasses import dataclass
 
@@ -10,23 +10,26 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 MAX_NUM_POINTS = 3000
-"""Points that are looked for in all images, the same share of each track length."""
+"""Maximum number of sampled points, drawn evenly over track lengths."""
 MIN_TRACK_LENGTH = 3
+"""Minimum number of images that see a sampled point."""
 NEAR_DEG = 15.0
-"""An image should see a point in its frame where another image sees it, at the point, from this near."""
+"""Degrees; an image should see a point in its frame if another image sees it, and their rays at the point meet at no
+more than this angle."""
 
 
 @dataclass(frozen=True, eq=False)
 class SampledTracks:
-    """Points that three images or more see.
+    """A sample of the points that three images or more see.
 
     Attributes
     ----------
     points : (k, 3) array
+        World frame.
     sees : (k, n) bool array
-        Images that see each.
+        Whether each image sees each point.
     num_observations : int
-        Of all such points, the ones that were not sampled among them.
+        Number of observations of all such points, sampled or not.
     """
 
     points: Array
@@ -37,7 +40,7 @@ class SampledTracks:
 def sampled_tracks(
     reconstruction: "pycolmap.Reconstruction", image_ids: list[int], max_num_points: int = MAX_NUM_POINTS
 ) -> SampledTracks:
-    """An even sample of a model's points by their tracks' lengths.
+    """Sample a model's points evenly over their track lengths.
 
     Parameters
     ----------
@@ -62,7 +65,7 @@ def sampled_tracks(
 
 
 def in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xyz: Array) -> BoolArray:
-    """Points (k, 3) that project into each image, (k, n)."""
+    """Whether each of the points (k, 3), world frame, projects into each image, (k, n)."""
     inside = np.zeros((len(xyz), len(image_ids)), dtype=bool)
     for column, image_id in enumerate(image_ids):
         image = reconstruction.image(image_id)

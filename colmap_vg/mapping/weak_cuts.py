@@ -1,9 +1,9 @@
-"""Where few pairs hold a model together: is what both sides should see seen by both?
+"""Find weak cuts of a model, which few pairs cross, and check each by missing correspondences.
 
-Parts of two scenes that look alike, or two ends of one, are joined by false pairs whose tracks agree with each other.
-But once they lie over one another, images of one side should see the points of the other, and do so only where the
-parts are alike (missing correspondences, as in :mod:`colmap_vg.mapping.second_opinion`). Only pairs of images that were
-compared count: what nobody matched is not missing.
+False pairs join parts of two scenes that look alike, or two ends of one scene, and their tracks agree with each other.
+But once the parts overlap in the model, images of one side should see the points of the other, and do so only where
+the parts are alike (missing correspondences, as in :mod:`colmap_vg.mapping.second_opinion`). Only pairs of images that
+were compared count: a correspondence is not missing where no matching was tried.
 """
 
 from collections.abc import Iterable
@@ -25,18 +25,21 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MAX_CONDUCTANCE = 0.2
-"""Of a cut that is weak. Photographs of one place had 0.03 (a ring of 47) to 0.33 at their weakest cut."""
+"""Maximum conductance of a weak cut, dimensionless. The weakest cut of photographs of one place had 0.03 (a ring of 47)
+to 0.33."""
 MIN_IMAGES, MAX_NUM_CUTS = 3, 6
-"""Of a side; and cuts that are looked at, of the largest parts first."""
+"""Minimum number of images on each side; maximum number of cuts, those of the largest parts first."""
 MAX_DISTANCE_RATIO = 1.3
-"""Of two images from a point that both should see: along a street features are lost as they grow."""
+"""Maximum ratio of the distances of two images from a point that both should see: along a street, features are no
+longer detected as their scale in the image grows."""
 MAX_NUM_POINTS = 1500
+"""Maximum number of sampled points."""
 MIN_EXPECTED = 30
-"""Observations, below which nothing can be told."""
+"""Minimum number of expected observations across a cut to judge it."""
 MIN_SHARE_OF_USUAL = 0.65
-"""Share of what should be seen across a cut that is, over the share elsewhere: 0.77 to 1.13 on photographs and in
-simulated scenes of one place, linked by one pair or many; 0.10 to 0.58 where two places with a third of their points
-alike lay over one another."""
+"""Minimum ratio of the share of expected observations that exist across a cut to that share elsewhere: measured 0.77 to
+1.13 on photographs and simulated scenes of one place, linked by one pair or many; 0.10 to 0.58 where two places with a
+third of their points alike overlapped."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,12 @@ class WeakCut:
     images : frozenset of int
         Ids of the smaller side's images. The other side is the rest of the model, or of a side of an earlier cut.
     num_pairs, num_matches : int
-        Pairs across that agree with the model, and their inlier matches.
+        Number of pairs across the cut that agree with the model, and of their inlier matches.
     num_expected, num_seen : int
-        Of points that one side sees, looked for in near images of the other that were compared with it; and found.
+        Number of expected observations across the cut (points that an image of one side sees and a near image of the
+        other, compared with it, should see), and of those that exist.
     share_seen_elsewhere : float
-        Of what should be seen on the same side, the share that is.
+        Share of the expected observations within the sides that exist.
     """
 
     images: frozenset[int]
@@ -64,12 +68,12 @@ class WeakCut:
 
     @property
     def share_seen(self) -> float:
-        """Share of what should be seen across that is; 0 where nothing should."""
+        """Share of the expected observations across the cut that exist; 0 without any."""
         return self.num_seen / self.num_expected if self.num_expected else 0.0
 
     @property
     def contradicted(self) -> bool:
-        """Whether too little is seen across for the sides to show one place."""
+        """Whether too few expected observations exist across the cut for both sides to show one place."""
         usual = MIN_SHARE_OF_USUAL * self.share_seen_elsewhere
         return self.num_expected >= MIN_EXPECTED and self.share_seen < usual
 
@@ -77,14 +81,14 @@ class WeakCut:
 def weak_cuts(
     reconstruction: "pycolmap.Reconstruction", pairs: PairRotations, compared: IntArray
 ) -> tuple[WeakCut, ...]:
-    """Cuts of a finished model that few pairs cross, and what its points say of each.
+    """Find the cuts of a finished model that few pairs cross, and count the expected observations across each.
 
     Parameters
     ----------
     reconstruction : pycolmap.Reconstruction
     pairs : PairRotations
     compared : (k, 2) int64 array
-        Ids of images that were compared, whether or not they matched.
+        Ids of the image pairs that were compared, whether or not they matched.
 
     Returns
     -------
@@ -92,28 +96,28 @@ def weak_cuts(
     """
     image_ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
     links = agreeing_pairs(reconstruction, image_ids, pairs)
-    return _judged(reconstruction, image_ids, links, compared, _weak_sides(len(image_ids), *links))
+    return _evaluated_cuts(reconstruction, image_ids, links, compared, _weak_sides(len(image_ids), *links))
 
 
 def cut_along(
     reconstruction: "pycolmap.Reconstruction", pairs: PairRotations, compared: IntArray, images: Iterable[int]
 ) -> WeakCut:
-    """The cut between some images of a model, by their ids, and the rest; see :func:`weak_cuts`."""
+    """Evaluate the cut between the images of given ids and the rest of a model, as :func:`weak_cuts` does."""
     image_ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
     links = agreeing_pairs(reconstruction, image_ids, pairs)
     side = np.isin(image_ids, sorted(images))
-    (cut,) = _judged(reconstruction, image_ids, links, compared, [(np.ones(len(image_ids), dtype=bool), side)])
+    (cut,) = _evaluated_cuts(reconstruction, image_ids, links, compared, [(np.ones(len(image_ids), dtype=bool), side)])
     return cut
 
 
-def _judged(
+def _evaluated_cuts(
     reconstruction: "pycolmap.Reconstruction",
     image_ids: IntArray,
     links: tuple[IntArray, Array],
     compared: IntArray,
     sides: list[tuple[BoolArray, BoolArray]],
 ) -> tuple[WeakCut, ...]:
-    """Cuts of parts (n,) into a side (n,) and the rest, with what points say of them."""
+    """Count pairs and expected observations across cuts, each given by a part (n,) and one of its sides (n,)."""
     if not sides:
         return ()
     edges, matches = links
@@ -136,7 +140,7 @@ def _judged(
 
 
 def _weak_sides(num_images: int, edges: IntArray, matches: Array) -> list[tuple[BoolArray, BoolArray]]:
-    """Parts (n,) and smaller sides (n,) of their weak cuts: the largest component, and then the sides of cuts."""
+    """Parts (n,) with a weak cut and its smaller side (n,): the largest component first, then the sides of cuts."""
     sides: list[tuple[BoolArray, BoolArray]] = []
     parts = [components_by_size(num_images, edges) == 0] if len(edges) else []
     while parts and len(sides) < MAX_NUM_CUTS:
@@ -162,13 +166,13 @@ def _weak_sides(num_images: int, edges: IntArray, matches: Array) -> list[tuple[
 
 
 def _within(images: BoolArray, edges: IntArray) -> IntArray:
-    """Edges by rows among the images marked (n,)."""
+    """Renumber the ends of edges to rows among the marked images (n,)."""
     return np.asarray(np.cumsum(images)[edges] - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Expected:
-    """Points that an image (j,) should see because a near one (i,) sees them, and whether it does."""
+    """Expected observations (k,): a point, an image that should see it, a near image that sees it, and if it exists."""
 
     points: IntArray
     images: IntArray
@@ -176,7 +180,7 @@ class _Expected:
     seen: BoolArray
 
     def counts(self, part: BoolArray, side: BoolArray, across: bool) -> tuple[int, int]:
-        """Points and images expected in a part by images of the other side or the same, and of these the seen ones."""
+        """Numbers of expected and existing observations in a part, across its cut or within its sides."""
         counted = ((side[self.images] != side[self.near]) == across) & part[self.images] & part[self.near]
         keys, first = np.unique(self.points[counted] * len(side) + self.images[counted], return_index=True)
         return len(keys), int(self.seen[counted][first].sum())
@@ -191,7 +195,7 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     point_of_sight, looking = np.nonzero(in_frame(reconstruction, ids, tracks.points))
     sights = np.concatenate([[0], np.cumsum(np.bincount(point_of_sight, minlength=len(tracks.points)))])
     seen_point, seeing = np.nonzero(tracks.sees)
-    # Each image that sees a point beside each that it lies in the frame of.
+    # Pair each image that sees a point with each image that the point projects into.
     rows, offsets = rows_of_segments(sights.astype(np.int64), seen_point)
     beside = segment_of_rows(offsets)
     point, image, near = point_of_sight[rows], looking[rows], seeing[beside]

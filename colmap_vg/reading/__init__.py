@@ -1,1 +1,1 @@
-"""From the tables of a database to a viewing graph: calibrations, two-view geometries, relative poses."""
+"""Read a viewing graph from the tables of a database: calibrations, two-view geometries, relative poses."""

@@ -1,10 +1,10 @@
-"""Radial distortion of lenses whose calibration tells none, found before any pose is trusted.
+"""Estimate a radial distortion term for cameras without distortion, before any relative pose is estimated.
 
-A known focal length is not a known lens. Two-view geometries that were verified without distortion hold those matches
-only that bend little, and every pose found from them bends with the lens. Here the matches as they were before
-verification are undistorted by a range of one-parameter lenses; the right one makes most of them agree with fundamental
-matrices. The lens is COLMAP's polynomial with the radius over half of the image's diagonal, ``r_d = r_u (1 + kappa
-r_u^2)``, which needs no focal length.
+Where distortion is not modelled, two-view verification keeps only the matches that it hardly affects, and all poses
+estimated from them are biased. Here the matches as they were before verification are undistorted with a range of
+one-parameter models; the correct one maximises the number of matches that agree with fundamental matrices. The model is
+COLMAP's polynomial with the radius in units of half the image diagonal, ``r_d = r_u (1 + kappa r_u^2)``, which needs no
+focal length.
 """
 
 from dataclasses import replace
@@ -24,18 +24,22 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 COARSE, FINE = np.array([-0.3, -0.2, -0.1, 0.0, 0.12]), np.linspace(-0.06, 0.06, 7)
+"""Values of kappa that are tried, dimensionless; then offsets from the best of them."""
 MAX_PAIRS, PAIRS_PER_IMAGE, MAX_MATCHES, MIN_MATCHES = 16, 3, 200, 30
+"""Maximum number of pairs, of pairs per image, and of matches per pair; minimum number of matches per pair."""
 MAX_ERROR_PX, MAX_NUM_TRIALS = 2.0, 300
+"""Maximum Sampson error of RANSAC, pixels, and its maximum number of trials."""
 MIN_GAIN = 1.03
-"""Matches that agree under a lens over those that agree without distortion: 1.06 to 1.22 on wide views with a radial
-term of -0.1 or less, and 1.012 at most on photographs whose lenses bend little."""
+"""Minimum ratio of the number of agreeing matches with distortion to that without: measured 1.06 to 1.22 on wide views
+with a radial term of -0.1 or less, and 1.012 at most on photographs with little distortion."""
 NUM_NEWTON = 30
+"""Newton iterations that invert the polynomial."""
 FOLD = 0.98
-"""Of the largest radius that a lens of negative term reaches: pixels beyond it have no ray."""
+"""Share of the largest distorted radius for a negative kappa, beyond which pixels cannot be undistorted."""
 
 
 def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[str]) -> tuple[DatabaseTables, Array]:
-    """Tables with a radial term for cameras that have no distortion, where the matches tell one.
+    """Add a radial term to cameras without distortion, where the matches support one.
 
     Parameters
     ----------
@@ -45,9 +49,9 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
     Returns
     -------
     tables : DatabaseTables
-        Pairs of such cameras have their matches before verification, where the database holds them, and no matrices.
+        Pairs of such cameras have no matrices, and their matches before verification if the database holds them.
     terms : (c,) array
-        COLMAP's radial term of each camera, at the focal length of the database; 0 where none was found.
+        COLMAP's radial term of each camera, dimensionless, at the focal length of the database; 0 where none was found.
     """
     terms = np.zeros(len(tables.cameras))
     kinds: dict[object, list[int]] = {}
@@ -56,7 +60,7 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
             kinds.setdefault((camera.model_name, camera.width, camera.height), []).append(row)
     caveats = []
     for rows in kinds.values():
-        kappa, gain = _found_term(tables, database_path, np.isin(tables.camera_idx, rows))
+        kappa, gain = _estimated_term(tables, database_path, np.isin(tables.camera_idx, rows))
         if kappa == 0.0:
             continue
         for row in rows:
@@ -64,21 +68,23 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
             terms[row] = kappa * (lens.mean_focal_length() / (0.5 * np.hypot(lens.width, lens.height))) ** 2
         others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
         caveats.append(
-            f"Camera {tables.cameras[rows[0]].camera_id}{others}: the database tells no distortion, and"
-            f" {gain - 1.0:.0%} more of the matches agree under a radial term of {terms[rows[0]]:.3f}. It is used from"
-            " the start, and pairs are verified anew."
+            f"Camera {tables.cameras[rows[0]].camera_id}{others}: the database has no distortion, but"
+            f" {gain - 1.0:.0%} more matches agree with a radial term of {terms[rows[0]]:.3f}. This is the initial"
+            " distortion, and the pairs are verified again with it."
         )
     if not caveats:
         return tables, terms
     cameras = tuple(with_radial_term(c, t) if t else c for c, t in zip(tables.cameras, terms.tolist(), strict=True))
-    bent = replace(tables, cameras=cameras, caveats=(*tables.caveats, *caveats))
-    of_bent = np.asarray((terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1))
-    return with_raw_matches(bent, database_path, of_bent), terms
+    distorted = replace(tables, cameras=cameras, caveats=(*tables.caveats, *caveats))
+    of_distorted = np.asarray((terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1))
+    return with_raw_matches(distorted, database_path, of_distorted), terms
 
 
-def _found_term(tables: DatabaseTables, database_path: str | PathLike[str], images: BoolArray) -> tuple[float, float]:
-    """The term under which most matches between marked images agree, and the gain over none; 0 where that is small."""
-    pairs, matches = _matches_to_ask(tables, database_path, images)
+def _estimated_term(
+    tables: DatabaseTables, database_path: str | PathLike[str], images: BoolArray
+) -> tuple[float, float]:
+    """Kappa that maximises the agreeing matches between marked images, and its gain; 0 where the gain is too small."""
+    pairs, matches = _sampled_matches(tables, database_path, images)
     if not pairs:
         return 0.0, 1.0
     points = [
@@ -95,10 +101,10 @@ def _found_term(tables: DatabaseTables, database_path: str | PathLike[str], imag
     return (float(fine[int(np.argmax(counts))]), gain) if gain >= MIN_GAIN else (0.0, 1.0)
 
 
-def _matches_to_ask(
+def _sampled_matches(
     tables: DatabaseTables, database_path: str | PathLike[str], images: BoolArray
 ) -> tuple[list[tuple[int, int]], list[IntArray]]:
-    """Pairs of marked images with most matches, a few of each image, and their matches before verification."""
+    """Sample pairs of marked images with many matches, a few per image, and their matches before verification."""
     row_of = {int(image_id): row for row, image_id in enumerate(tables.image_ids)}
     count = np.zeros(len(tables.image_ids), dtype=int)
     pairs, found = [], []
@@ -123,7 +129,7 @@ def _matches_to_ask(
 
 
 def _centered(tables: DatabaseTables, image: int, rows: IntArray) -> tuple[Array, float]:
-    """Keypoints (k, 2) about the principal point over half of the image's diagonal, and that half, pixels."""
+    """Keypoints (k, 2) relative to the principal point, in units of half the image diagonal, and that half, pixels."""
     camera = tables.cameras[tables.camera_idx[image]]
     half = 0.5 * float(np.hypot(camera.width, camera.height))
     middle = np.array([camera.principal_point_x, camera.principal_point_y])
@@ -131,7 +137,7 @@ def _centered(tables: DatabaseTables, image: int, rows: IntArray) -> tuple[Array
 
 
 def _num_agreeing(points: list[list[tuple[Array, float]]], kappa: float) -> int:
-    """Matches of all pairs that agree with their pair's fundamental matrix once they are undistorted."""
+    """Number of matches that agree with their pair's fundamental matrix after undistortion, over all pairs."""
     options = pycolmap.RANSACOptions(
         max_error=MAX_ERROR_PX, min_num_trials=30, max_num_trials=MAX_NUM_TRIALS, random_seed=0
     )
@@ -151,13 +157,14 @@ def undistorted(points: Array, kappa: float) -> Array:
     Parameters
     ----------
     points : (k, 2) array
-        About the principal point.
+        Relative to the principal point, in units of half the image diagonal.
     kappa : float
+        Dimensionless.
 
     Returns
     -------
     (k, 2) array
-        NaN beyond `FOLD` of the largest radius that such a lens reaches.
+        NaN beyond `FOLD` of the largest distorted radius.
     """
     r = np.linalg.norm(points, axis=1)
     largest = np.sqrt(-1.0 / (3.0 * kappa)) if kappa < 0 else np.inf

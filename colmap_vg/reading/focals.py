@@ -1,8 +1,9 @@
-"""Whether the focal lengths of a database can be trusted, and those to use where they cannot.
+"""Decide whether the focal lengths of a database can be trusted, and estimate those that cannot.
 
-The database's own words do not tell: with a prior, COLMAP verifies pairs by essential matrices and calls them
-CALIBRATED under a focal length 15 % off; without one, nearly every pair is UNCALIBRATED, and so are false pairs under a
-right focal length. The matches tell: each pair's fundamental matrix votes for the focals that make it essential.
+The configurations in the database do not decide it: with a prior, COLMAP verifies pairs by essential matrices and
+labels them CALIBRATED even if the focal length is 15 % off; without one, nearly every pair is UNCALIBRATED, and so are
+false pairs under a correct focal length. The matches decide it: each pair's fundamental matrix votes for the focal
+lengths that make it essential.
 """
 
 from collections.abc import Sequence
@@ -26,12 +27,15 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 ALIKE = 0.03
-"""Relative difference below which two votes are taken for one lens; lenses differ by more, or it does not matter."""
+"""Relative difference of focal lengths below which two votes count as equal; lenses that differ by less may be merged
+without harm."""
 MAX_PAIRS_PER_CAMERA = 400
-"""Pairs that vote for a camera, those of most matches."""
+"""Maximum number of pairs that vote for a camera, those with most matches."""
 MIN_MATCHES_PER_VOTE = 16
+"""Minimum number of matches of a pair that votes."""
 MAX_MATCHES_PER_VOTE = 300
-"""Matches of a pair that its vote uses, evenly over its list; more change the vote by less than its own error."""
+"""Maximum number of a pair's matches that its vote uses, sampled evenly from its list; more change the vote by less
+than its own error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +45,11 @@ class FocalDecision:
     Attributes
     ----------
     scales : (c,) array
-        Factor on each camera's focal length in the database.
+        Factor on each camera's focal length in the database, dimensionless.
     known : (c,) bool array
-        The focal length was given and is not contradicted.
+        Whether the focal length was given and is not contradicted.
     caveats : tuple of str
-        What was changed or could not be decided, one sentence each.
+        Sentences on what was changed or could not be decided.
     """
 
     scales: Array
@@ -54,7 +58,7 @@ class FocalDecision:
 
 
 def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalDecision:
-    """Decide for each camera whether its focal length is kept, and by what factor it changes where not."""
+    """Decide for each camera whether its focal length is kept, and by what factor it is changed otherwise."""
     prior = np.array([c.has_prior_focal_length for c in tables.cameras], dtype=bool)
     as_given = np.ones(len(prior))
     if options.trust_focal_lengths == "always":
@@ -63,7 +67,7 @@ def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalD
 
 
 def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, ...]:
-    """Sentences on focal lengths that are kept, although image pairs tell others."""
+    """Sentences on focal lengths that are kept although image pairs contradict them."""
     focals = np.array([c.focal_length_x for c in tables.cameras])
     calibration = _self_calibration(tables, focals, np.ones(len(focals), dtype=bool), options)
     if calibration is None:
@@ -73,11 +77,11 @@ def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, 
     if len(against) == 0:
         return ()
     first = against[0]
-    others = f" So it is with {len(against) - 1} more cameras." if len(against) > 1 else ""
+    others = f" The same holds for {len(against) - 1} more cameras." if len(against) > 1 else ""
     return (
-        f"Camera {tables.cameras[first].camera_id}: {votes.support[first]} of {votes.num_pairs[first]} image pairs tell"
-        f" a focal length of {votes.focal_lengths[first]:.1f} px, not the {focals[first]:.1f} px of the database, which"
-        f" is kept as asked.{others}",
+        f"Camera {tables.cameras[first].camera_id}: {votes.support[first]} of {votes.num_pairs[first]} image pairs"
+        f" support a focal length of {votes.focal_lengths[first]:.1f} px, not the {focals[first]:.1f} px of the"
+        f" database, which is kept as requested.{others}",
     )
 
 
@@ -98,31 +102,31 @@ def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> Fo
         if bad
     ]
     if without.any():
-        source = "they take that of the other cameras" if calibration.decided.any() else "COLMAP's guess is used"
+        source = "that of the other cameras is used" if calibration.decided.any() else "COLMAP's guess is used"
         caveats.append(
-            f"{int(without.sum())} of {len(focals)} cameras have no focal length, and their pairs do not tell it;"
+            f"{int(without.sum())} of {len(focals)} cameras have no focal length, and their pairs do not determine it;"
             f" {source}."
         )
     return FocalDecision(np.asarray(scales, dtype=float), given & ~calibration.found, tuple(caveats))
 
 
 def _why_unchecked(tables: DatabaseTables, options: ReadOptions) -> str:
-    """The caveat of a database in which no pair can vote."""
+    """Warning for a database in which no pair can vote."""
     enough = np.diff(tables.offsets) >= max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)
     flat = np.isin(tables.configs, (PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC))
     if (enough & flat).any():
-        why = f"in {int((enough & flat).sum())} pairs all matches are on one plane, or the camera turned on the spot"
+        why = f"in {int((enough & flat).sum())} pairs all matches lie on one plane, or the camera only rotated"
     elif enough.any():
         why = "COLMAP found no geometry for the pairs that have enough matches"
     else:
-        why = f"no pair has the {max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)} matches that it takes"
-    return f"The focal lengths cannot be checked, and are taken as they are in the database: {why}."
+        why = f"no pair has the required {max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)} matches"
+    return f"The focal lengths cannot be checked, and those of the database are used: {why}."
 
 
 def _in_common(tables: DatabaseTables, found: Array, calibration: SelfCalibration, given: BoolArray) -> Array:
-    """Focal lengths, equal among alike cameras without a given one unless their own pairs contradict it.
+    """Share one focal length among cameras of one model and size without a given one, unless their pairs contradict it.
 
-    Most such folders were taken with one lens. Cameras that could not vote take what the others of the folder have.
+    Most such sets of images were taken with one lens. Cameras whose pairs determine none get that of the others.
     """
     decided, sigmas = calibration.decided & ~given, calibration.by_pairs.estimates.sigmas
     size = np.array([max(c.width, c.height) for c in tables.cameras], dtype=float)
@@ -187,7 +191,7 @@ def _self_calibration(
 
 
 def _strongest_of_cameras(cameras: IntArray, num_matches: IntArray) -> BoolArray:
-    """Pairs (m,) that are among the strongest of one of their cameras (m, 2)."""
+    """Whether each pair is among those with most matches of one of its cameras (m, 2), (m,)."""
     pair = np.tile(np.arange(len(cameras)), 2)
     camera = cameras.T.ravel()
     order = np.lexsort((pair, -num_matches[pair], camera))

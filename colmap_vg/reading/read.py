@@ -1,4 +1,4 @@
-"""From a COLMAP database to a viewing graph: every image, every verified pair, each with a verdict."""
+"""Read a viewing graph from a COLMAP database: all images, and all verified pairs with a verdict each."""
 
 from os import PathLike
 
@@ -15,7 +15,7 @@ from colmap_vg.reading.distortion import with_found_distortion
 from colmap_vg.reading.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.reading.relative_poses import relative_poses
 from colmap_vg.reading.still_background import without_still_background
-from colmap_vg.reading.verification import with_own_geometries
+from colmap_vg.reading.verification import with_verified_geometries
 from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.two_view.segments import evenly_thinned, segment_subset
@@ -26,12 +26,13 @@ BoolArray = NDArray[np.bool_]
 
 
 def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | None = None) -> ViewGraph:
-    """Viewing graph of a COLMAP database, which is never modified.
+    """Read the viewing graph of a COLMAP database.
 
     Parameters
     ----------
     database_path : path
-        A database with keypoints and verified matches, by COLMAP of any version or by another matcher.
+        A database with keypoints and verified matches, by COLMAP of any version or by another matcher. It is never
+        modified.
     options : ReadOptions, optional
 
     Returns
@@ -52,14 +53,14 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
 
 @single_threaded_blas
 def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) -> tuple[ViewGraph, tuple[str, ...]]:
-    """The viewing graph, and what was changed or could not be decided on reading, one sentence each."""
+    """Read the viewing graph, and sentences on what was changed or could not be decided on reading."""
     tables = read_tables(database_path)
     terms = np.zeros(len(tables.cameras))
     if options.find_distortion:
         tables, terms = with_found_distortion(tables, database_path)
     tables, thinned = without_still_background(tables, database_path)
     expected = thinned | (terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1)
-    tables, changed = with_own_geometries(tables, options.random_seed, expected)
+    tables, changed = with_verified_geometries(tables, options.random_seed, expected)
     changed |= thinned
     focals = decide_focal_lengths(tables, options)
     return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
@@ -76,7 +77,7 @@ def _graph(
     num_inliers = np.diff(offsets)
     excluded = listed_edges(options.excluded_pairs_path, tables.image_names, tables.pairs)
     trusted = listed_edges(options.trusted_pairs_path, tables.image_names, tables.pairs) & ~excluded
-    # A trusted pair needs no confirmation of its fundamental matrix.
+    # A trusted pair is used even if nothing confirms its fundamental matrix.
     doubted = trusted & (geometry.verdicts == EdgeVerdict.UNCALIBRATED)
     verdicts = np.where(excluded, str(EdgeVerdict.EXCLUDED), geometry.verdicts)
     verdicts = np.where(doubted, str(EdgeVerdict.KEPT), verdicts)

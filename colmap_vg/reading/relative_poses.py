@@ -1,7 +1,7 @@
-"""Trustworthy relative poses of a database's pairs, each by what COLMAP found it to be, and refined on its inliers.
+"""Estimate the relative poses of a database's pairs according to their two-view configurations, and refine them.
 
-Stored poses are candidates like others: they are used where the inliers fit them best. Seen on real databases: poses
-that are identity and zero with E filled in, homographies whose stored pose is 85 degrees off.
+Stored poses are candidates among others, used where the inliers fit them best. Real databases were seen to hold
+identity rotations and zero translations beside a valid E, and planar pairs whose stored pose is 85 degrees off.
 """
 
 from dataclasses import dataclass, replace
@@ -47,39 +47,41 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MIN_SHARE_IN_FRONT = 0.5
-"""Below this share of matches in front of both cameras a pose is a guess."""
+"""Minimum share of matches in front of both cameras; poses with a smaller one are not used."""
 MAX_MEDIAN_ERROR_PX = 4.0
-"""COLMAP's own two-view threshold; a pose whose median match is beyond it explains nothing."""
+"""Maximum median Sampson error of a pose's matches, pixels: COLMAP's threshold of two-view verification."""
 MIN_ANGLE = np.radians(0.2)
-"""Median triangulation angle below which the direction of a pair says nothing."""
+"""Median triangulation angle, radians, below which a pair does not determine its direction."""
 MAX_SPURIOUS_ANGLE = np.radians(3.0)
-"""Median triangulation angle that noise alone gives to a pair without baseline, at most."""
+"""Maximum median triangulation angle, radians, that noise alone gives to a pair without baseline."""
 ROTATION_SHARE = 1.3
-"""A pair is a pure rotation when that explains its matches within this factor of what the full pose's median error
-makes one expect; the pose has fitted some of the noise (measured: a factor of 1.05 to 1.25)."""
+"""A pair is a pure rotation if the median error of a rotation is at most this factor above the one expected from the
+full pose's median error. The full pose fits some of the noise (measured: a factor of 1.05 to 1.25)."""
 ROTATION_NOISE = 2.47
-"""Median error of a rotation over that of an epipolar line for the same noise: sqrt(2) 1.177 (both coordinates of both
-matched points, Rayleigh's median) over 0.6745 (one normal variable)."""
+"""Ratio of the median error of a rotation to that of an epipolar line for the same noise: sqrt(2) 1.177 (both
+coordinates of both matched points, median of the Rayleigh distribution) over 0.6745 (one normal variable)."""
 MIN_FITTING_SHARE, MIN_NUM_FITTING = 0.8, 100
-"""A pair that COLMAP found uncalibrated under a trusted focal length is used where so many of its matches fit a
-calibrated pose: on repeated structure false pairs were seen to reach 74, at shares up to 0.96."""
+"""Minimum share and number of matches that fit a calibrated pose, for a pair that COLMAP labelled uncalibrated under a
+trusted focal length to be used: false pairs of repeated structure reached 74 matches, and shares up to 0.96."""
 MAX_MATCHES_PER_POSE = 1000
-"""Matches of a pair that its pose is refined on, evenly over its list."""
+"""Maximum number of a pair's matches that refine its pose, sampled evenly from its list."""
 MAX_MATCHES_PER_CHOICE = 150
-"""Matches by which candidates for a pair's pose are compared: their differences are gross."""
+"""Maximum number of a pair's matches that compare candidate poses, whose errors differ greatly."""
 SAME_MATRIX = 1e-8
-"""Of the cosine between matrices: 0.01 degrees, far less than the refinement moves a pose."""
+"""One minus the cosine between two essential matrices below which they are equal: 0.01 degrees, far less than the
+refinement changes a pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairGeometry:
-    """Relative poses of pairs and what can be said of them.
+    """Relative poses of pairs with their precision and verdicts.
 
     Attributes
     ----------
     rotations : (m, 3, 3) array
         cam2_from_cam1.
     directions : (m, 3) array
+        Unit vectors from the first camera to the second, in the first camera's frame.
     angles : (m,) array
         Median triangulation angles, radians.
     information : (m, 5, 5) array
@@ -98,7 +100,7 @@ class PairGeometry:
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """Rays of all pairs' inliers."""
+    """Bearings of all pairs' inlier matches."""
 
     offsets: IntArray
     bearings1: Array
@@ -114,7 +116,7 @@ class _Matches:
         return np.abs(residuals(self._rays, poses.rotations, poses.directions))
 
     def medians(self, errors: Array) -> Array:
-        """Median of the matches' errors of each pair; infinite for pairs without matches."""
+        """Median error of each pair's matches, (m,); infinite for pairs without matches."""
         return np.nan_to_num(segment_quantiles(self.offsets, errors), nan=np.inf)
 
     def shares_within(self, errors: Array, bounds: Array) -> Array:
@@ -143,18 +145,21 @@ def relative_poses(
     bearings2: Array,
     min_num_inliers: int,
 ) -> PairGeometry:
-    """Relative poses of all pairs, with a verdict for each.
+    """Estimate the relative poses of all pairs, and give each a verdict.
 
     Parameters
     ----------
     tables : DatabaseTables
     focal_scales : (c,) array
-        Factors on the database's focal lengths under which the bearings were taken.
+        Factors on the database's focal lengths with which the bearings were computed.
     focal_trusted : (c,) bool array
-        Where both cameras' focal lengths are, UNCALIBRATED pairs are refused.
+        Whether each focal length is trusted. UNCALIBRATED pairs of two cameras that are need more matches.
     offsets : (m + 1,) int array
+        Matches of pair k are rows ``offsets[k]:offsets[k + 1]`` of the bearings.
     bearings1, bearings2 : (k, 3) array
+        Unit vectors in the first and the second camera's frame.
     min_num_inliers : int
+        Minimum number of matches of a pair that is used.
 
     Returns
     -------
@@ -209,7 +214,7 @@ def relative_poses(
 
 
 def _essential_matrices(tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, unchanged: BoolArray) -> Array:
-    """E where it was found under the same focal lengths, else from F, else refitted from the matches."""
+    """Essential matrices: E if it was estimated with the same focal lengths, else from F, else from the matches."""
     E = np.where(unchanged[:, None, None], tables.E, np.nan)
     from_F = essential_from_fundamental(tables.F, K1, K2)
     missing = ~_usable(E)
@@ -224,7 +229,7 @@ def _essential_matrices(tables: DatabaseTables, matches: _Matches, K1: Array, K2
 def _better_of_stored_and_decomposed(
     tables: DatabaseTables, matches: _Matches, E: Array, unchanged: BoolArray
 ) -> RelativePoses:
-    """Stored poses that are E's own; else of the stored pose and of E's that which the matches like more."""
+    """Stored poses that are decompositions of E; elsewhere the stored pose or that of E, whichever fits better."""
     length = np.linalg.norm(tables.translations, axis=1)
     with np.errstate(invalid="ignore"):
         present = unchanged & np.isfinite(tables.rotations).all(axis=(1, 2)) & (length > 0)
@@ -250,7 +255,7 @@ def _better_of_stored_and_decomposed(
 def _better_planar(
     tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, planar: BoolArray, poses: RelativePoses
 ) -> RelativePoses:
-    """The homography's better decomposition for planar pairs, where the matches like it more than E's pose."""
+    """Replace poses of planar pairs by the homography's better decomposition where it fits the matches better."""
     with_H = planar & _usable(tables.H)
     if not with_H.any():
         return poses
@@ -262,7 +267,7 @@ def _better_planar(
 
 
 def _preferred(matches: _Matches, one: RelativePoses, other: RelativePoses) -> BoolArray:
-    """Whether the matches like one pose more: clearly more of them in front, or as many and a lower median error."""
+    """Whether one pose fits better: clearly more matches in front of both cameras, or as many and a lower error."""
     margin = 0.1
     ahead = one.share_in_front - other.share_in_front
     closer = matches.medians(matches.errors(one)) < matches.medians(matches.errors(other))
@@ -275,7 +280,7 @@ def _where(mask: BoolArray, one: RelativePoses, other: RelativePoses) -> Relativ
 
 
 def _pure_rotation(matches: _Matches, poses: RelativePoses, medians: Array) -> tuple[BoolArray, Array]:
-    """Which pairs a rotation alone explains about as well, and that rotation."""
+    """Whether a pure rotation fits each pair about as well as its pose, (m,), and the rotations to use, (m, 3, 3)."""
     turned, rotations = poses.median_angles < MIN_ANGLE, poses.rotations.copy()
     suspects = np.flatnonzero(poses.median_angles < MAX_SPURIOUS_ANGLE)
     of_suspects = matches.of(suspects)
@@ -287,7 +292,7 @@ def _pure_rotation(matches: _Matches, poses: RelativePoses, medians: Array) -> t
 
 
 def _usable(matrices: Array) -> BoolArray:
-    """Matrices that are there: finite and not zero."""
+    """Whether each matrix is finite and not zero."""
     return np.asarray(
         np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.nan_to_num(matrices)).max(axis=(1, 2), initial=0.0) > 0)
     )

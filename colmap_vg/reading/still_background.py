@@ -1,7 +1,7 @@
-"""Objects that turn before a camera that stands still.
+"""Remove the matches of a static background behind a rotating object, where the camera does not move.
 
-The background then agrees with a camera that never moved, and where it has more matches than the object, verification
-keeps it alone. Without the matches that stand still, the object's are left: as if the camera went around it.
+The background's matches agree with a camera that never moved, and where they outnumber the object's, verification keeps
+only them. Without them, the object's matches remain, as if the camera moved around it.
 """
 
 from dataclasses import replace
@@ -17,42 +17,43 @@ from colmap_vg.two_view.segments import evenly_thinned, segment_quantiles, segme
 BoolArray = NDArray[np.bool_]
 
 MAX_STILL_PX = 2.0
-"""Pixels; matches that move less stand still, but for the noise of keypoints."""
+"""Maximum displacement of a static match, pixels, allowing for keypoint noise."""
 MIN_SHARE_STILL = 0.5
-"""Of pairs whose median match stands still, above which the camera does. Half of the pairs of a camera that moves by so
-little tell no direction either."""
-MATCHES_LOOKED_AT, MIN_NUM_MATCHES = 50, 15
-"""Matches of a pair whose median is taken, and the least number that makes one: COLMAP's of inliers."""
+"""Share of pairs with a static median match above which the camera is static. A moving camera with so small
+displacements would not determine the directions of half of its pairs either."""
+MAX_MATCHES_CHECKED, MIN_NUM_MATCHES = 50, 15
+"""Maximum number of a pair's matches whose median is computed; minimum number of matches of a pair, as COLMAP's of
+inliers."""
 
 
 def without_still_background(
     tables: DatabaseTables, database_path: str | PathLike[str]
 ) -> tuple[DatabaseTables, BoolArray]:
-    """Tables without the matches that stand still, where most pairs consist of them.
+    """Remove static matches where the median match of most pairs is static.
 
     Returns
     -------
     tables : DatabaseTables
-        Of such a database, without the matches that stand still; pairs whose median match does have the other ones as
-        they were before verification, and no matrices.
+        Without static matches, if the camera is static. Pairs whose median match is static then have no matrices, and
+        the other matches as they were before verification.
     changed : (m,) bool array
-        Pairs that lost matches.
+        Whether each pair's matches changed.
     """
-    asked = np.diff(tables.offsets) >= MIN_NUM_MATCHES
-    few = evenly_thinned(tables.offsets, MATCHES_LOOKED_AT)
+    enough = np.diff(tables.offsets) >= MIN_NUM_MATCHES
+    few = evenly_thinned(tables.offsets, MAX_MATCHES_CHECKED)
     thinned = replace(tables, matches=tables.matches[few], offsets=segment_subset(tables.offsets, few))
-    still = asked & (segment_quantiles(thinned.offsets, _motions(thinned)) <= MAX_STILL_PX)
-    if still.sum() <= MIN_SHARE_STILL * asked.sum():
+    still = enough & (segment_quantiles(thinned.offsets, _motions(thinned)) <= MAX_STILL_PX)
+    if still.sum() <= MIN_SHARE_STILL * enough.sum():
         return tables, np.zeros(len(still), dtype=bool)
     raw = with_raw_matches(tables, database_path, still)
     moving = _motions(raw) > MAX_STILL_PX
     offsets = segment_subset(raw.offsets, moving)
     if not (np.diff(offsets) >= MIN_NUM_MATCHES).any():
-        # Nothing turns: the camera stood still before a scene that did.
+        # Nothing moves: camera and scene are both static.
         return tables, np.zeros(len(still), dtype=bool)
     caveat = (
-        f"In {int(still.sum())} of {int(asked.sum())} pairs the background does not move with the object: matches that"
-        f" stand still, {1.0 - moving.mean():.0%}, are left out. Masks of the background are safer."
+        f"In {int(still.sum())} of {int(enough.sum())} pairs the background does not move with the object: static"
+        f" matches ({1.0 - moving.mean():.0%} of all) are removed. Masking the background is more reliable."
     )
     found = replace(
         raw,

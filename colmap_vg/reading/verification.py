@@ -1,9 +1,9 @@
-"""Which two-view geometries of a database explain their own matches, and new ones for those that do not.
+"""Check that the two-view geometries of a database explain their matches, and estimate new ones for those that do not.
 
-Databases are filled by many tools: matrices may be placeholders, belong to other matches, or be missing, and matches
-may never have been verified. A matrix or pose is believed when the median match of its pair is within COLMAP's
-threshold of it, as it stands or on undistorted keypoints. Elsewhere the matrices are forgotten; where the matches do
-not agree on a geometry of their own, pycolmap verifies them.
+Many tools write databases: matrices may be placeholders, belong to other matches, or be missing, and matches may never
+have been verified. A matrix or pose is accepted if the median match of its pair is within COLMAP's threshold, with
+keypoints as they are or undistorted. Otherwise the pair's matrices are discarded, and where its matches do not agree
+with one fundamental matrix, pycolmap verifies them.
 """
 
 from dataclasses import replace
@@ -31,83 +31,88 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MAX_ERROR_PX = 4.0
-"""COLMAP's threshold of two-view verification."""
+"""COLMAP's threshold of two-view verification, pixels."""
 MIN_SHARE_AGREEING = 0.97
-"""Of a pair's matches, within the threshold of one fundamental matrix, that makes them look verified."""
-MATCHES_LOOKED_AT = 100
+"""Minimum share of a pair's matches within the threshold of one fundamental matrix for them to count as verified."""
+MAX_MATCHES_CHECKED = 100
+"""Maximum number of a pair's matches that check its matrices."""
 MIN_NUM_MATCHES, MIN_NUM_REFITTED = 15, 8
+"""Minimum number of inliers of a verified pair, as COLMAP's; minimum number of matches to estimate a matrix from."""
 FAR = 1e12
-"""Pixels; where a matrix is missing or tells nothing of a match."""
+"""Distance, pixels, in place of an undefined one: the matrix is missing or degenerate for the match."""
 
 
-def with_own_geometries(
+def with_verified_geometries(
     tables: DatabaseTables, seed: int, expected: BoolArray | None = None
 ) -> tuple[DatabaseTables, BoolArray]:
-    """Tables whose matrices explain their matches, or are missing.
+    """Replace the two-view geometries that do not explain their matches.
 
     Parameters
     ----------
     tables : DatabaseTables
     seed : int
-        Of the verification.
+        Random seed of the verification.
     expected : (m,) bool array, optional
-        Pairs that are known to need it, and need no caveat.
+        Pairs that are known to need new geometries, and for which there is no warning.
 
     Returns
     -------
     tables : DatabaseTables
-        With a caveat where pairs were changed.
+        All matrices explain their matches or are NaN; with a caveat if pairs were changed.
     changed : (m,) bool array
-        Pairs whose configuration or matches are not those of the database.
+        Whether each pair's configuration or matches may differ from those of the database.
     """
-    straight, valid = undistorted_keypoints(tables)
+    undistorted, valid = undistorted_keypoints(tables)
     raw = np.concatenate([*tables.keypoints, np.zeros((0, 2))]).astype(np.float64)
     judged = ~np.isin(tables.configs, (DEGENERATE, WATERMARK)) & (np.diff(tables.offsets) >= MIN_NUM_REFITTED)
-    as_seen = (raw,) if np.array_equal(raw, straight) else (raw, straight)
-    unbelieved = np.flatnonzero(judged & ~_explained(tables, as_seen))
+    as_seen = (raw,) if np.array_equal(raw, undistorted) else (raw, undistorted)
+    unexplained = np.flatnonzero(judged & ~_explained(tables, as_seen))
     changed = np.zeros(len(tables.pairs), dtype=bool)
-    if len(unbelieved) == 0:
+    if len(unexplained) == 0:
         return tables, changed
-    changed[unbelieved] = True
-    rows, offsets = rows_of_segments(tables.offsets, unbelieved)
-    first, second = (tables.matched_keypoints(rows, unbelieved, offsets, side) for side in (0, 1))
+    changed[unexplained] = True
+    rows, offsets = rows_of_segments(tables.offsets, unexplained)
+    first, second = (tables.matched_keypoints(rows, unexplained, offsets, side) for side in (0, 1))
     seen = valid[first] & valid[second]
-    points1, points2, offsets = straight[first[seen]], straight[second[seen]], segment_subset(offsets, seen)
+    points1, points2, offsets = undistorted[first[seen]], undistorted[second[seen]], segment_subset(offsets, seen)
     F = estimate_fundamental_from_inliers(offsets, points1, points2)
     agree = np.abs(epipolar_distances(F, offsets, points1, points2)) <= MAX_ERROR_PX
     shares = segment_sums(offsets, agree.astype(float)) / np.maximum(np.diff(offsets), 1)
     configs, matrices = tables.configs.copy(), {name: getattr(tables, name).copy() for name in ("E", "F", "H")}
     for matrix in matrices.values():
-        matrix[unbelieved] = np.nan
+        matrix[unexplained] = np.nan
     given = np.array([c.has_prior_focal_length for c in tables.cameras], dtype=bool)
     prior = np.asarray(given[tables.camera_idx[tables.pairs]].all(axis=1))
     undefined = configs == UNDEFINED
     configs[undefined] = np.where(prior[undefined], CALIBRATED, UNCALIBRATED)
-    # Under a given focal length the pose is found from the rays; else the fundamental matrix must tell it.
-    guessed = unbelieved[~prior[unbelieved]]
-    matrices["F"][guessed] = F[~prior[unbelieved]]
+    # With given focal lengths the pose is estimated from the bearings, otherwise from the fundamental matrix.
+    guessed = unexplained[~prior[unexplained]]
+    matrices["F"][guessed] = F[~prior[unexplained]]
     rotations, translations = tables.rotations.copy(), tables.translations.copy()
-    rotations[unbelieved], translations[unbelieved] = np.nan, np.nan
-    doubtful = unbelieved[shares < MIN_SHARE_AGREEING]
+    rotations[unexplained], translations[unexplained] = np.nan, np.nan
+    doubtful = unexplained[shares < MIN_SHARE_AGREEING]
     found = replace(tables, configs=configs, rotations=rotations, translations=translations, **matrices)
     caveat = (
-        f"{len(unbelieved)} of {len(tables.pairs)} pairs hold no matrix that explains their matches; their geometry is"
-        " estimated from the matches."
+        f"{len(unexplained)} of {len(tables.pairs)} pairs have no matrix that explains their matches; their two-view"
+        " geometry is estimated from the matches."
     )
     if len(doubtful):
         before = int(np.diff(tables.offsets)[doubtful].sum())
         found = _verified(found, doubtful, seed)
         after = int(np.diff(found.offsets)[doubtful].sum())
-        caveat += f" In {len(doubtful)} of them matches look unverified: {before - after} of {before} were wrong."
-    if expected is not None and expected[unbelieved].all():
+        caveat += (
+            f" In {len(doubtful)} of them the matches were not verified: {before - after} of {before} are outliers and"
+            " are removed."
+        )
+    if expected is not None and expected[unexplained].all():
         return found, changed
     return replace(found, caveats=(*tables.caveats, caveat)), changed
 
 
 def _explained(tables: DatabaseTables, pixels: tuple[Array, ...]) -> BoolArray:
-    """Pairs (m,) whose median match is near one of their matrices, on pixels as they are or undistorted."""
+    """Whether the median match of each pair is near one of its matrices, in original or undistorted pixels, (m,)."""
     every = np.arange(len(tables.pairs))
-    thin = evenly_thinned(tables.offsets, MATCHES_LOOKED_AT)
+    thin = evenly_thinned(tables.offsets, MAX_MATCHES_CHECKED)
     offsets, rows = segment_subset(tables.offsets, thin), np.flatnonzero(thin)
     first, second = (tables.matched_keypoints(rows, every, offsets, side) for side in (0, 1))
     K = np.linalg.inv(np.array([calibration_matrix(c) for c in tables.cameras]).reshape(-1, 3, 3))
@@ -134,7 +139,7 @@ def epipolar_distances(F: Array, offsets: IntArray, points1: Array, points2: Arr
 
 
 def transfers(H: Array, offsets: IntArray, points1: Array, points2: Array) -> Array:
-    """Distances (k,) of matches from where a homography takes them, pixels."""
+    """Transfer errors (k,) of matches under homographies, in the second image, pixels."""
     x1 = np.concatenate([points1, np.ones((len(points1), 1))], axis=1)
     moved = np.einsum("kab,kb->ka", H[segment_of_rows(offsets)], x1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -142,7 +147,7 @@ def transfers(H: Array, offsets: IntArray, points1: Array, points2: Array) -> Ar
 
 
 def _verified(tables: DatabaseTables, pairs: IntArray, seed: int) -> DatabaseTables:
-    """Tables with the inlier matches, matrices and configurations of pairs that pycolmap verified."""
+    """Verify pairs with pycolmap, and replace their matches, matrices and configurations by the result."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     kept = [tables.matches[a:b] for a, b in zip(tables.offsets[:-1], tables.offsets[1:], strict=True)]
@@ -170,7 +175,7 @@ def _verified(tables: DatabaseTables, pairs: IntArray, seed: int) -> DatabaseTab
 
 
 def _pinhole(lens: "pycolmap.Camera") -> "pycolmap.Camera":
-    """The camera that undistorted keypoints are of."""
+    """Pinhole camera of the undistorted keypoints."""
     K = calibration_matrix(lens)
     return pycolmap.Camera(
         model="PINHOLE",

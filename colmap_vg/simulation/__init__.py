@@ -1,1 +1,1 @@
-"""Scenes with known truth, for research and tests; nothing that users run imports them."""
+"""Synthetic scenes with known poses, for research and tests; not used by jobs."""

@@ -1,4 +1,4 @@
-"""Synthetic views as a COLMAP database: keypoints, matches and two-view geometries, no descriptors."""
+"""Write synthetic views as a COLMAP database with keypoints, matches and two-view geometries, without descriptors."""
 
 from os import PathLike
 
@@ -12,7 +12,7 @@ CAMERA_ID = 1
 
 
 def write_synthetic_database(database_path: str | PathLike[str], views: SyntheticViews) -> None:
-    """Write views into a new database: one calibrated pinhole camera, images 1, 2, ... named by their rows.
+    """Write views to a new database with one calibrated pinhole camera and images 1, 2, ... named by their rows.
 
     Parameters
     ----------

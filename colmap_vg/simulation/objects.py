@@ -1,9 +1,9 @@
-"""Viewing graphs of objects photographed from all sides, nearly half of whose pairs are false.
+"""Simulated viewing graphs of objects photographed from all sides, with nearly half of the pairs false.
 
-Objects repeat themselves: opposite sides and repeated parts make pairs that agree with each other and not with the
-scene, and their relative poses are as precise as those of true pairs. What tells them apart is the number of their
-inliers: on photographs of objects whose truth is known 84 to 96 % of the pairs with fewer than 30 inliers were false,
-and 0 to 3 % of those with more than 300 (`FALSE_SHARES`).
+Objects have repeated structure: opposite sides and repeated parts cause false pairs that agree with each other but not
+with the scene, and whose relative poses are as precise as those of true pairs. They differ by their number of inliers:
+on photographs of objects with known poses 84 to 96 % of the pairs with fewer than 30 inliers were false, and 0 to 3 %
+of those with more than 300 (`FALSE_SHARES`).
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,17 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 FALSE_SHARES = ((15, 0.84, 0.96), (30, 0.53, 0.90), (60, 0.25, 0.66), (120, 0.06, 0.38), (300, 0.0, 0.03))
-"""From how many inliers on which share of the pairs is false, in an easy and in a hard scene."""
+"""Rows of a number of inliers, and the share of pairs with at least that many that is false in an easy and in a hard
+scene."""
 MEDIAN_INLIERS, INLIER_SPREAD = 110.0, 1.1
-"""Of the log-normal distribution of the numbers of inliers."""
+"""Median number of inliers of a pair, and standard deviation of its logarithm (log-normal)."""
 MIN_INLIERS = 15
+"""Minimum number of inliers of a pair."""
 SIDE_INLIERS, SIDE_WIDTH = 600.0, np.radians(35.0)
-"""Matches of two views of one side from one place, and how they fall with the angle between them."""
+"""Matches of two views of one side from the same position, and the width, radians, of the Gaussian by which they
+decrease with the angle between the views."""
 MAX_VIEW_ANGLE = np.radians(75.0)
-"""Between the viewing directions of a true pair."""
+"""Twice the maximum angle, radians, between the viewing directions of a coherent false pair after moving the second."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +43,11 @@ class ObjectNoise:
     rotation_deg, direction_deg : float
         Standard deviation in each tangent axis of a pair with `MEDIAN_INLIERS` inliers, degrees.
     hardness : float
-        0 to 1, between the two ends of `FALSE_SHARES`.
+        Interpolates `FALSE_SHARES` between an easy (0) and a hard (1) scene.
     coherent_share : float
-        Of the false pairs, 0 to 1: those by opposite sides and repeated parts; the others are random.
+        Share of the false pairs, 0 to 1, that opposite sides and repeated parts cause; the others are random.
     focal_error : float
-        Relative error of the focal length: relative rotations come out that much too large.
+        Relative error of the focal length, by which relative rotations are too large.
     """
 
     rotation_deg: float = 0.3
@@ -55,14 +58,14 @@ class ObjectNoise:
 
 
 def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = None, seed: int = 0) -> SyntheticScene:
-    """Viewing graph of cameras on rings around an object.
+    """Simulate the viewing graph of cameras on rings around an object.
 
     Parameters
     ----------
     num_images : int
         8 or more.
     num_edges : int
-        True and false pairs together, at least four an image.
+        Number of true and false pairs together, at least four per image.
     noise : ObjectNoise, optional
     seed : int
 
@@ -74,14 +77,14 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
     Raises
     ------
     OptionError
-        There are too few images or pairs, more pairs than the images have, a share is outside 0 to 1, or noise is not
+        There are too few images or pairs, or more pairs than possible, a share is outside 0 to 1, or noise is not
         positive.
     """
     noise = noise or ObjectNoise()
     num_pairs = num_images * (num_images - 1) // 2
     if num_images < 8 or not 4 * num_images <= num_edges <= num_pairs:
         raise OptionError(
-            f"object_scene: {num_edges} pairs of {num_images} images; take 8 images or more, and from "
+            f"object_scene: {num_edges} pairs of {num_images} images; use at least 8 images, and from "
             f"{4 * num_images} to {num_pairs} pairs"
         )
     if not (noise.rotation_deg > 0 and noise.direction_deg > 0):
@@ -93,7 +96,7 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
     drawn = np.exp(np.log(MEDIAN_INLIERS) + INLIER_SPREAD * rng.standard_normal(num_edges))
     inliers = -np.sort(-np.maximum(np.round(drawn), MIN_INLIERS).astype(np.int64))
     wrong = rng.random(num_edges) < _false_share(inliers, noise.hardness)
-    # The pairs of most overlap are the true ones, and those of most overlap among them have most inliers.
+    # The pairs with most overlap are the true ones, and among these the inliers decrease with the overlap.
     pairs = _pairs_by_overlap(p, rng)
     num_true = int((~wrong).sum())
     relative, direction = _relative_poses(R, p, pairs[:num_true])
@@ -104,7 +107,7 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
     relative = np.concatenate([relative, wrong_relative])
     direction = np.concatenate([direction, wrong_direction])
     counts = np.concatenate([inliers[~wrong], rng.permutation(inliers[wrong])])
-    # How precise a pair is does not tell whether it is true.
+    # The precision of a pair does not depend on whether it is true.
     fewness = np.sqrt(MEDIAN_INLIERS / rng.permutation(counts)) * np.exp(0.3 * rng.standard_normal(num_edges))
     rotation_sigma, direction_sigma = (
         np.radians(noise.rotation_deg) * fewness,
@@ -131,19 +134,19 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
 def symmetric_object_scene(
     num_images: int, num_sides: int, unique_share: float = 0.3, noise: ObjectNoise | None = None, seed: int = 0
 ) -> SyntheticScene:
-    """Viewing graph of cameras on one ring around an object with equal sides, on a ground that is not.
+    """Simulate the viewing graph of cameras on a ring around an object with equal sides on an asymmetric ground.
 
-    Each pair of images is matched as it would be if the object were turned by the number of sides that brings the two
-    views nearest; the ground has a say only where nothing is turned.
+    The matches of each pair of images are those of the object rotated by the number of sides for which the two views
+    have most matches; the ground adds matches only where that number is 0.
 
     Parameters
     ----------
     num_images : int
         8 or more.
     num_sides : int
-        Equal sides, 2 or more.
+        Number of equal sides, 2 or more.
     unique_share : float
-        Matches on the ground over those on the object.
+        Ratio of the matches on the ground to those on the object.
     noise : ObjectNoise, optional
         `hardness`, `coherent_share` and `focal_error` are not used.
     seed : int
@@ -151,7 +154,7 @@ def symmetric_object_scene(
     Returns
     -------
     SyntheticScene
-        `outlier` marks pairs matched across sides.
+        `outlier` marks pairs that match different sides.
 
     Raises
     ------
@@ -161,8 +164,8 @@ def symmetric_object_scene(
     noise = noise or ObjectNoise()
     if num_images < 8 or num_sides < 2 or unique_share < 0:
         raise OptionError(
-            f"symmetric_object_scene: {num_images} images, {num_sides} sides and a unique share of {unique_share}; take"
-            " 8 images, 2 sides and a share of 0 or more"
+            f"symmetric_object_scene: {num_images} images, {num_sides} sides and a unique share of {unique_share}; use"
+            " at least 8 images, 2 sides and a share of 0"
         )
     rng = np.random.default_rng(seed)
     turn = 2.0 * np.pi * np.arange(num_images) / num_images
@@ -209,14 +212,14 @@ def _cameras(num_images: int, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _false_share(inliers: IntArray, hardness: float) -> Array:
-    """Share of the pairs with that many inliers that is false."""
+    """Share of false pairs among those with the given numbers of inliers."""
     starts, low, high = np.array(FALSE_SHARES).T
     row = np.searchsorted(starts, inliers, side="right") - 1
     return np.asarray(low[row] + hardness * (high[row] - low[row]))
 
 
 def _pairs_by_overlap(p: Array, rng: np.random.Generator) -> IntArray:
-    """All pairs (k, 2), those that see most of the same first: by the angle between them, and chance."""
+    """All pairs (k, 2) in the order of decreasing overlap: by the angle between the views, with random noise."""
     i, j = np.triu_indices(len(p), 1)
     looks = normalized(p)
     angle = np.arccos(np.clip(np.einsum("ka,ka->k", looks[i], looks[j]), -1.0, 1.0))
@@ -232,10 +235,10 @@ def _relative_poses(R: Array, p: Array, edges: IntArray) -> tuple[Array, Array]:
 def _false_pairs(
     R: Array, p: Array, pairs: IntArray, count: int, coherent_share: float, rng: np.random.Generator
 ) -> tuple[IntArray, Array, Array]:
-    """Some of the pairs that see nothing in common, with the relative poses that look-alikes give them.
+    """Choose false pairs among pairs without overlap, and give them coherent or random relative poses.
 
-    A coherent one takes its second image for where that would stand if the object's other side, or another part of it,
-    were this one: turned about the vertical by one of two angles, half a turn or a random one.
+    In a coherent false pair the second camera is rotated about the vertical axis of the object, as if another side were
+    this one, by one of two angles: half a turn or a random one.
     """
     turns = np.array([np.pi, rng.uniform(0.3, 0.7) * np.pi])
     moved = [so3.exp(np.array([[0.0, 0.0, a]]))[0] for a in turns]
@@ -252,7 +255,7 @@ def _false_pairs(
     i, j, kind = pairs[rows, 0], pairs[rows, 1], which[rows]
     relative = R_moved[kind, j] @ np.swapaxes(R[i], 1, 2)
     direction = normalized(np.einsum("kab,kb->ka", R[i], p_moved[kind, j] - p[i]))
-    # What matches by chance looks alike from alike places: turns of 10 to 60 degrees, as false pairs were seen to have.
+    # Random matches are of views that look alike: measured false pairs had relative rotations of 10 to 60 degrees.
     chance = len(alike) + np.arange(len(others))
     axes = normalized(rng.standard_normal((len(others), 3)))
     relative[chance] = so3.exp(axes * np.radians(rng.uniform(5.0, 60.0, (len(others), 1))))

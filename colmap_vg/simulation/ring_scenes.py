@@ -1,4 +1,4 @@
-"""Scenes whose truth is known: cameras, view graphs with noise and outliers, and matches of scene points."""
+"""Synthetic rings of cameras and view graphs with noise and outliers, with known poses."""
 
 from dataclasses import dataclass
 
@@ -14,15 +14,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SyntheticScene:
-    """A view graph and the poses it was made from.
+    """A view graph and its true poses.
 
     Attributes
     ----------
     graph : ViewGraph
     cam_from_world_rotations : (n, 3, 3) array
     projection_centers : (n, 3) array
+        World frame.
     outlier : (m,) bool array
-        Edges whose relative pose was replaced by a random one.
+        Whether the relative pose of each edge is false.
     """
 
     graph: ViewGraph
@@ -32,7 +33,7 @@ class SyntheticScene:
 
 
 def ring_cameras(num_images: int, rng: np.random.Generator, radius: float = 4.0) -> tuple[Array, Array]:
-    """Cameras around the origin, jittered in radius and height, looking at it: rotations (n, 3, 3), centres (n, 3)."""
+    """Cameras on a jittered ring that look at the origin: cam_from_world rotations (n, 3, 3), centres (n, 3)."""
     turn = 2.0 * np.pi * (np.arange(num_images) + 0.3 * rng.random(num_images)) / num_images
     distance = radius * (1.0 + 0.15 * rng.standard_normal(num_images))
     centers = np.stack(
@@ -42,14 +43,14 @@ def ring_cameras(num_images: int, rng: np.random.Generator, radius: float = 4.0)
 
 
 def look_at(centers: Array, targets: Array) -> Array:
-    """cam_from_world rotations (n, 3, 3) of cameras with the world's z axis up in the image."""
+    """cam_from_world rotations (n, 3, 3) of cameras that look at targets, with the world's z axis up in the image."""
     forward = normalized(targets - centers)
     right = normalized(np.cross(forward, np.array([0.0, 0.0, 1.0])))
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
 def nearest_neighbor_edges(centers: Array, num_neighbors: int) -> NDArray[np.int64]:
-    """Edges (m, 2), i < j, from each camera to its nearest ones."""
+    """Edges (m, 2), i < j, from each camera to its nearest neighbours."""
     distance = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     near = np.argsort(distance, axis=1)[:, 1 : num_neighbors + 1]
     pairs = np.stack([np.repeat(np.arange(len(centers)), near.shape[1]), near.ravel()], axis=1)
@@ -66,7 +67,10 @@ def scene_from_poses(
     outlier_share: float = 0.0,
     rng: np.random.Generator,
 ) -> SyntheticScene:
-    """View graph of given cameras and edges, with isotropic noise (radians, each tangent axis) and random outliers."""
+    """Make the view graph of given cameras and edges, with isotropic noise and random outliers.
+
+    The standard deviations are those of each tangent axis, radians.
+    """
     R, p = cam_from_world_rotations, projection_centers
     i, j = edges[:, 0], edges[:, 1]
     relative = so3.perturbed(R[j] @ np.swapaxes(R[i], 1, 2), rotation_sigma, rng)
@@ -96,7 +100,7 @@ def ring_scene(
     outlier_share: float = 0.0,
     seed: int = 0,
 ) -> SyntheticScene:
-    """A ring of cameras, each linked to its nearest neighbours."""
+    """Make a ring of cameras whose edges link nearest neighbours, with noise as in :func:`scene_from_poses`."""
     rng = np.random.default_rng(seed)
     R, p = ring_cameras(num_images, rng)
     return scene_from_poses(

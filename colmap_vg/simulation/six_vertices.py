@@ -1,9 +1,9 @@
-"""The six-vertex graph of Fig. 4 of Nasiri et al., where the orthogonal metric puts two cameras in the wrong place.
+"""The six-vertex graph of Fig. 4 of Nasiri et al., for which the orthogonal metric gives two cameras wrong positions.
 
-Four cameras stand at the corners of a rhombus, two close to each other near its middle, on the diagonal between cameras
-1 and 2, to which they are linked. Directions from 1 and 2 that are wrong by a few degrees can then be met best behind
-one of them, where the sine of the angle is as small as in front. The paper gives no coordinates: here the rhombus is
-two equilateral triangles, and the inner cameras are a hundredth of its side apart.
+Four cameras are at the corners of a rhombus, and two close to each other near its centre, on the diagonal between
+cameras 1 and 2, to which they are linked. If the directions from 1 and 2 are wrong by a few degrees, the best fit may
+be a position behind one of them, where the sine of the angle is as small as in front. The paper gives no coordinates:
+here the rhombus is two equilateral triangles, and the inner cameras are a hundredth of its side apart.
 """
 
 import numpy as np
@@ -25,19 +25,19 @@ INNER = np.array([4, 5])
 
 
 def six_vertex_scene(error_deg: float = 5.0, *, seed: int = 0) -> SyntheticScene:
-    """The graph with exact rotations and every direction turned by the same angle, one way or the other, in its plane.
+    """Make the graph with exact rotations and all directions rotated in its plane by one angle with random signs.
 
     Parameters
     ----------
     error_deg : float
-        Degrees.
+        Angle, degrees.
     seed : int
-        Of the signs.
+        Random seed of the signs.
 
     Returns
     -------
     SyntheticScene
-        Cameras have the world's axes.
+        All rotations are the identity.
     """
     i, j = SIX_EDGES.T
     sign = np.random.default_rng(seed).choice([-1.0, 1.0], len(SIX_EDGES))
@@ -53,7 +53,7 @@ def six_vertex_scene(error_deg: float = 5.0, *, seed: int = 0) -> SyntheticScene
 
 
 def inner_cameras_outside(centers: Array) -> NDArray[np.bool_]:
-    """Whether each inner camera lies outside the solved rhombus, seen along the normal of its best plane.
+    """Whether each inner camera is outside the solved rhombus, after projection to its best plane.
 
     Parameters
     ----------

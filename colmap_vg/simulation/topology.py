@@ -1,7 +1,8 @@
-"""Cameras and noise on the adjacency of real image collections, so that solvers meet real degrees, leaves and bridges.
+"""Simulate cameras and noisy edges on the adjacency of real image collections, with its degrees, leaves and bridges.
 
-Images that see each other stand near each other: the images are ordered by the Fiedler vector of the adjacency's
-normalised Laplacian, and laid out along that order. The noise of an edge grows as its baseline and its matches shrink.
+Linked images are close to each other: the images are ordered by the Fiedler vector of the adjacency's normalised
+Laplacian, and placed along that order. The noise of an edge increases as its baseline and its number of matches
+decrease.
 """
 
 from dataclasses import dataclass
@@ -23,9 +24,9 @@ IntArray = NDArray[np.int64]
 
 Layout = Literal["street", "ring", "clusters", "collinear"]
 MEDIAN_INLIERS = 80.0
-"""Matches of the median edge; spread log-normally, as in real databases."""
+"""Median number of matches of an edge; the distribution is log-normal, as in real databases."""
 MIN_STATED_SIGMA_DEG = 1e-3
-"""Least standard deviation in the graph's information matrices: exact edges would know infinitely much."""
+"""Minimum standard deviation in the graph's information matrices, degrees; exact edges would have infinite ones."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +38,17 @@ class TopologyNoise:
     rotation_deg, direction_deg : float
         Standard deviation in each tangent axis of an edge with median baseline and median matches, degrees.
     baseline_power : float
-        Direction noise grows with ``(median baseline / baseline) ** baseline_power``; 1 is the law of two-view geometry
-        at fixed depth.
+        Direction noise is proportional to ``(median baseline / baseline) ** baseline_power``; two-view geometry at
+        fixed depth has a power of 1.
     max_direction_deg : float
-        Cap of the direction noise.
+        Maximum standard deviation of directions, degrees.
     match_spread : float
-        Logarithms of the numbers of matches have this standard deviation; noise goes with their inverse square root.
+        Standard deviation of the logarithm of the number of matches; noise is inversely proportional to its square
+        root.
     outlier_share : float
-        Edges with a random relative pose, 0 to 1.
+        Share of edges with a random relative pose, 0 to 1.
     false_cluster_share : float
-        Edges of look-alike structure: between two groups of images, wrong in one and the same way.
+        Share of edges of repeated structure, 0 to 1: between two groups of images, wrong by one common rigid motion.
     """
 
     rotation_deg: float = 0.5
@@ -66,7 +68,7 @@ def scene_on_topology(
     noise: TopologyNoise | None = None,
     seed: int = 0,
 ) -> SyntheticScene:
-    """A scene with a given adjacency.
+    """Simulate a scene with a given adjacency.
 
     Parameters
     ----------
@@ -74,15 +76,16 @@ def scene_on_topology(
     edges : (m, 2) int array
         For instance of a 1DSfM set, from `colmap_vg.datasets.mat.read_topology_mat`.
     layout : "street", "ring", "clusters" or "collinear"
-        ``clusters`` has groups far from each other, so near and far pairs; ``collinear`` runs of cameras on lines.
+        ``clusters`` has groups far from each other, and so short and long baselines; ``collinear`` has sequences of
+        cameras on lines.
     noise : TopologyNoise, optional
     seed : int
 
     Returns
     -------
     SyntheticScene
-        `outlier` marks random outliers and edges of false clusters. The graph's `edge_information` is that of the true
-        noise; outliers state it, too.
+        `outlier` marks random outliers and edges of false clusters. The graph's `edge_information` is that of the
+        simulated noise, also for outliers.
 
     Raises
     ------
@@ -105,11 +108,11 @@ def scene_on_topology(
 
 
 def adjacency_order(num_images: int, edges: IntArray) -> Array:
-    """Place of each image along the Fiedler vector of the normalised Laplacian, ranks scaled to [0, 1)."""
+    """Rank of each image along the Fiedler vector of the normalised Laplacian, scaled to [0, 1), (n,)."""
     A = sp.coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(num_images, num_images)).tocsr()
     A = sp.csr_array(A + A.T)
     scale = sp.diags_array(1.0 / np.sqrt(np.maximum(A.sum(axis=1), 1.0)))
-    start = np.cos(np.arange(num_images) * 0.7)  # any fixed vector: the same bits each time
+    start = np.cos(np.arange(num_images) * 0.7)  # an arbitrary fixed vector, for identical results
     _, vectors = spla.eigsh(sp.csr_array(scale @ A @ scale), k=2, which="LA", v0=start, tol=1e-6)
     order = np.argsort(scale @ vectors[:, 0], kind="stable")
     rank = np.empty(num_images)
@@ -142,7 +145,7 @@ def _centers(along: Array, layout: Layout, rng: np.random.Generator) -> Array:
 
 
 def _measured(R: Array, p: Array, edges: IntArray, noise: TopologyNoise, rng: np.random.Generator) -> SyntheticScene:
-    """Edges measured with noise by baseline and matches, with random outliers and coherent false clusters."""
+    """Make edges with noise that depends on baseline and matches, random outliers and coherent false clusters."""
     i, j = edges[:, 0], edges[:, 1]
     m = len(edges)
     baseline = np.linalg.norm(p[j] - p[i], axis=1)
@@ -157,7 +160,7 @@ def _measured(R: Array, p: Array, edges: IntArray, noise: TopologyNoise, rng: np
     direction = normalized(np.einsum("kab,kb->ka", R[i], p[j] - p[i]))
     false = _false_clusters(edges, len(p), round(noise.false_cluster_share * m), rng)
     if false.any():
-        # The second image of each such pair is taken for one that stands elsewhere, moved by one rigid motion.
+        # The second camera of each such pair is moved by one common rigid motion.
         turn = so3.random(1, rng)[0]
         shift = 0.3 * np.linalg.norm(p.max(axis=0) - p.min(axis=0)) * normalized(rng.standard_normal(3))
         R_false, p_false = R[j[false]] @ turn.T, p[j[false]] @ turn.T + shift
@@ -185,7 +188,7 @@ def _measured(R: Array, p: Array, edges: IntArray, noise: TopologyNoise, rng: np
 
 
 def _false_clusters(edges: IntArray, num_images: int, wanted: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """About as many edges as wanted, all from one side of a cut through the images to the other: (m,)."""
+    """Mark about the wanted number of edges, all across one cut through the images, (m,)."""
     false = np.zeros(len(edges), dtype=bool)
     if wanted == 0:
         return false
@@ -201,6 +204,6 @@ def _false_clusters(edges: IntArray, num_images: int, wanted: int, rng: np.rando
             break
         inside[np.bincount(outside_ends, minlength=num_images).argmax()] = True
     rows = np.flatnonzero(inside[edges].sum(axis=1) == 1)
-    # At most half of the cut, so that the truth still has the majority of the group's links.
+    # At most half of the cut is false, so that the majority of the edges across it is true.
     false[rng.permutation(rows)[: min(wanted, len(rows) // 2)]] = True
     return false

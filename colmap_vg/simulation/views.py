@@ -1,6 +1,6 @@
-"""What cameras along a street, around an object or over a field see: keypoints and matches of known truth, no images.
+"""Simulate keypoints and matches of cameras along a street, around an object or over a field, with known poses.
 
-Fast enough for thousands of images: each image looks for its points in a tree, and pairs share what both have seen.
+Fast enough for thousands of images: a k-d tree finds each image's points, and pairs match the points that both see.
 """
 
 from dataclasses import dataclass
@@ -22,36 +22,38 @@ IntArray = NDArray[np.int64]
 Layout = Literal["street", "ring", "drone"]
 
 FOCAL_PX, WIDTH, HEIGHT = 1200.0, 1600, 1200
-"""Pixels; 67 degrees across."""
+"""Focal length, width and height of all images, pixels; the horizontal field of view is 67 degrees."""
 PAIRS_PER_IMAGE = 10
+"""Mean number of pairs per image."""
 MIN_SHARED = 30
-"""Keypoints that two images share, at least, to be a pair."""
+"""Minimum number of common keypoints of a pair."""
 WRONG_PAIR_MATCHES = 40
+"""Number of matches of a wrong pair."""
 DETECTED = 0.75
-"""Share of the visible points that an image finds."""
+"""Share of the visible points that an image detects."""
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticViews:
-    """Images' keypoints and pairs' matches, with the cameras that they were made from.
+    """Keypoints of images and matches of pairs, with the true poses.
 
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
     projection_centers : (n, 3) array
-        Metres.
+        World frame, metres.
     keypoints : tuple of (k, 2) arrays
         Pixels, with noise.
     pairs : (m, 2) int64 array
         Image rows, the first below the second.
     matches : tuple of (k, 2) int64 arrays
-        Keypoints of each pair's images.
+        Rows of the keypoints of each pair's images.
     relative_rotations : (m, 3, 3) array
-        cam2_from_cam1 that the matches of each pair agree with.
+        cam2_from_cam1 rotations that the matches agree with.
     directions : (m, 3) array
-        Camera 2's centre in camera 1's frame, unit, likewise.
+        Unit vectors from camera 1 to camera 2 that the matches agree with, in camera 1's frame.
     wrong : (m,) bool array
-        Pairs of images that have nothing in common: their matches agree with a pose that is not there.
+        Whether the pair's images have nothing in common, and its matches agree with a false relative pose.
     """
 
     cam_from_world_rotations: Array
@@ -74,20 +76,20 @@ def synthetic_views(
     wrong_pair_share: float = 0.08,
     seed: int = 0,
 ) -> SyntheticViews:
-    """Make the views of a layout of cameras at an overlap that does not depend on their number.
+    """Simulate the views of cameras in a layout, with an overlap that does not depend on their number.
 
     Parameters
     ----------
     layout : str
-        "street": sideways along a bent street; "ring": around an object; "drone": downwards over a field, in rows.
+        "street": sideways along a curved street; "ring": around an object; "drone": downwards over a field, in rows.
     num_images : int
         3 or more.
     num_keypoints : int
-        Per image, about.
+        Approximate number per image.
     noise_px : float
         Standard deviation of keypoints, pixels.
     wrong_match_share, wrong_pair_share : float
-        Shares of all matches of right pairs, and of all pairs.
+        Share of wrong matches in correct pairs, and of wrong pairs among all pairs.
     seed : int
 
     Returns
@@ -100,7 +102,7 @@ def synthetic_views(
         Fewer than three images, or an unknown layout.
     """
     if num_images < 3:
-        raise OptionError(f"synthetic_views: {num_images} images make no scene; ask for 3 or more")
+        raise OptionError(f"synthetic_views: num_images is {num_images}; use 3 or more")
     rng = np.random.default_rng(seed)
     R, p, points, reach = _layout(layout, num_images, num_keypoints / DETECTED, rng)
     seen, pixels = _visible(R, p, points, reach, rng)
@@ -130,13 +132,16 @@ def synthetic_views(
 
 
 def _layout(layout: Layout, n: int, visible: float, rng: np.random.Generator) -> tuple[Array, Array, Array, float]:
-    """Rotations, centres, points of a density that shows `visible` of them, and how far a camera sees, metres."""
+    """Rotations, centres, points, and the visual range of the cameras, metres.
+
+    The density of the points is such that a camera sees about `visible` of them.
+    """
     along = np.arange(n) + 0.1 * rng.standard_normal(n)
     if layout == "street":
         p = np.stack([along, 1.5 * np.sin(along / 9.0), 0.2 * rng.standard_normal(n)], axis=1)
         R = look_at(p, p + np.stack([0.35 * rng.standard_normal(n), np.full(n, 8.0), 0.2 * rng.standard_normal(n)], 1))
         low, high = np.array([-8.0, 7.0, -4.0]), np.array([n + 8.0, 11.0, 4.0])
-        # At a distance of about 9 m a view is 12 m by 9 m, and the points fill 8 m of its height.
+        # At a distance of about 9 m a view covers 12 m by 9 m, of which the points fill 8 m of the height.
         return R, p, rng.uniform(low, high, (int(visible * (n + 16.0) / 12.0), 3)), 16.0
     if layout == "drone":
         across = max(int(np.ceil(np.sqrt(n))), 1)
@@ -149,7 +154,7 @@ def _layout(layout: Layout, n: int, visible: float, rng: np.random.Generator) ->
         points = rng.uniform([-20.0, -20.0, 0.0], [*(size - 20.0), 6.0], (int(visible * np.prod(size) / 1130.0), 3))
         return so3.exp(0.05 * rng.standard_normal((n, 3))) @ down, p, points, 60.0
     if layout == "ring":
-        # Neighbours are a metre apart and look at a wall around the middle, from outside.
+        # Neighbours are one metre apart and look from outside at a circular wall.
         radius = max(n / (2.0 * np.pi), 3.0)
         turn = 2.0 * np.pi * along / n
         outward = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=1)
@@ -159,13 +164,13 @@ def _layout(layout: Layout, n: int, visible: float, rng: np.random.Generator) ->
         turn, depth = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(-1.5, 1.5, count)
         wall = np.stack([np.cos(turn), np.sin(turn)], axis=1) * (radius + depth)[:, None]
         return R, p, np.concatenate([wall, rng.uniform(-3.5, 3.5, (count, 1))], axis=1), 13.0
-    raise OptionError(f"synthetic_views: no layout {layout!r}; choose one of street, ring, drone")
+    raise OptionError(f"synthetic_views: layout is {layout!r}; choose one of street, ring, drone")
 
 
 def _visible(
     R: Array, p: Array, points: Array, reach: float, rng: np.random.Generator
 ) -> tuple[list[IntArray], list[Array]]:
-    """Points that each image sees and finds, in rising order, and where, pixels."""
+    """Rows of the points that each image detects, ascending, and their pixels (k, 2)."""
     tree = cKDTree(points)
     seen, pixels = [], []
     for rotation, center, near in zip(R, p, tree.query_ball_point(p, reach, return_sorted=True), strict=True):
@@ -181,7 +186,7 @@ def _visible(
 
 
 def _best_pairs(seen: list[IntArray], num_points: int) -> IntArray:
-    """Pairs (m, 2) that share most: about `PAIRS_PER_IMAGE` times the number of images."""
+    """Pairs (m, 2) with most common points, at most `PAIRS_PER_IMAGE` times the number of images."""
     starts = np.concatenate([[0], np.cumsum([len(s) for s in seen])])
     sees = sp.csr_array((np.ones(starts[-1], dtype=np.int32), np.concatenate(seen), starts), (len(seen), num_points))
     shared = sp.coo_array(sp.triu(sees @ sees.T, k=1))
@@ -193,14 +198,14 @@ def _best_pairs(seen: list[IntArray], num_points: int) -> IntArray:
 
 
 def _shared(one: IntArray, other: IntArray) -> IntArray:
-    """Keypoints (k, 2) of two images that are the same point."""
+    """Rows of keypoints (k, 2) of two images that are projections of the same point."""
     place = np.minimum(np.searchsorted(other, one), max(len(other) - 1, 0))
     hit = np.flatnonzero(other[place] == one)
     return np.stack([hit, place[hit]], axis=1)
 
 
 def _unrelated_pairs(pairs: IntArray, num_images: int, count: int, rng: np.random.Generator) -> IntArray:
-    """Up to `count` pairs of images that are none of the pairs."""
+    """Draw at most `count` pairs of images that are not among the given ones."""
     drawn = np.sort(rng.integers(num_images, size=(4 * count, 2)), axis=1)
     keys = drawn[:, 0] * num_images + drawn[:, 1]
     fresh = (drawn[:, 0] != drawn[:, 1]) & ~np.isin(keys, pairs[:, 0] * num_images + pairs[:, 1])
@@ -211,7 +216,7 @@ def _unrelated_pairs(pairs: IntArray, num_images: int, count: int, rng: np.rando
 def _false_geometry(
     pairs: IntArray, keypoints: list[Array], noise_px: float, rng: np.random.Generator
 ) -> tuple[list[IntArray], Array, Array]:
-    """Matches of things alike that stand elsewhere, added to the images' keypoints, and the poses they agree with."""
+    """Add keypoints of false matches to the images; return the matches and the false relative poses they agree with."""
     m, k, middle = len(pairs), WRONG_PAIR_MATCHES, np.array([WIDTH, HEIGHT]) / 2
     rotations = so3.exp(0.15 * rng.standard_normal((m, 3)))
     directions = normalized(rng.standard_normal((m, 3)) * np.array([1.0, 1.0, 0.3]))

@@ -213,7 +213,7 @@ def test_missing_photographs_cost_the_colours_only(
         model = pycolmap.Reconstruction(output / "0")
         assert model.num_reg_images() == 4
         assert all((point.color == 0).all() for point in model.points3D.values())
-        caveats = [line for line in summary(output)["warnings"] if "4 of 4 registered images are not in" in line]
+        caveats = [line for line in summary(output)["warnings"] if "4 of 4 registered images are missing in" in line]
         assert len(caveats) == 1
         assert str(folder) in caveats[0]
 

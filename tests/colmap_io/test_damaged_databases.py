@@ -102,7 +102,7 @@ def test_images_without_verified_pairs_are_an_edgeless_graph_and_no_job(
 def test_another_sqlite_file_is_no_colmap_database(sound: Path, tmp_path: Path) -> None:
     path = changed_copy(sound, tmp_path / "other.db", "DROP TABLE keypoints")
     for read in (read_view_graph, check_database):
-        with pytest.raises(DatabaseError, match="no COLMAP database, it has no table keypoints"):
+        with pytest.raises(DatabaseError, match="not a COLMAP database, it has no table keypoints"):
             read(path)
 
 

@@ -29,7 +29,7 @@ def test_a_list_holds_two_names_a_line(tmp_path: Path) -> None:
     edges = np.array([[1, 0], [0, 2], [1, 2]])
     assert listed_edges(path, ["a.jpg", "b.jpg", "my photo.jpg"], edges).tolist() == [True, False, True]
     assert not listed_edges(None, ["a.jpg", "b.jpg", "my photo.jpg"], edges).any()
-    with pytest.raises(DataFileError, match=r"no images of the database .*my photo"):
+    with pytest.raises(DataFileError, match=r"not images of the database .*my photo"):
         listed_edges(path, ["a.jpg", "b.jpg"], edges[:1])
     path.write_text("a.jpg b.jpg\na.jpg\n", encoding="utf-8")
     with pytest.raises(DataFileError, match="line 2: two image names"):

@@ -74,8 +74,8 @@ VERTICES = ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1"
         ((*VERTICES, "EDGE_SE3:QUAT 0 1 1 0 nan 0 0 0 1 " + UPPER), ":3:", "NaN"),
         ((*VERTICES, "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 2 " + UPPER), ":3:", "quaternion"),
         ((*VERTICES, "VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1"), ":3:", "twice"),
-        ((*VERTICES, "VERTEX_SE3:QUAT 1.5 1 0 0 0 0 0 1"), ":3:", "no vertex id"),
-        (("VERTEX_SE2 0 0 0 0",), ":1:", "VERTEX_SE2 is not known"),
+        ((*VERTICES, "VERTEX_SE3:QUAT 1.5 1 0 0 0 0 0 1"), ":3:", "not a vertex id"),
+        (("VERTEX_SE2 0 0 0 0",), ":1:", "VERTEX_SE2 is unknown"),
         (("# nothing",), "graph.g2o:", "no VERTEX_SE3:QUAT"),
     ],
 )

@@ -84,7 +84,7 @@ def test_missing_and_cut_files(tmp_path):
     with pytest.raises(colmap_vg.ColmapVgError, match="middle of the cameras"):
         colmap_vg.read_bundle(tmp_path / "b.out")
     (tmp_path / "b.out").write_text("# Bundle file v0.3\n1 0\n800 0 0\n1 0 0\n0 1 0\n0 0 2\n0 0 0\n")
-    with pytest.raises(colmap_vg.ColmapVgError, match=r"b\.out:4: .*no rotation"):
+    with pytest.raises(colmap_vg.ColmapVgError, match=r"b\.out:4: .*not a rotation"):
         colmap_vg.read_bundle(tmp_path / "b.out")
 
 

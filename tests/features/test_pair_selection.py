@@ -10,8 +10,8 @@ from colmap_vg.features.pair_selection import (
     StrongestFeatures,
     mutual_matches,
     num_strongest,
+    pair_scores,
     preemptive_matches,
-    promise,
     select_pairs,
     strongest,
     strongest_features,
@@ -145,8 +145,8 @@ def test_every_image_keeps_its_best_and_all_are_connected(
     matches, consistent = counts
     n = len(matches)
     pairs = select_pairs(matches, consistent, min_partners)
-    promised = promise(matches, consistent)
-    assert promised[pairs[:, 0], pairs[:, 1]].sum() >= 0.979 * np.triu(promised).sum()
+    scores = pair_scores(matches, consistent)
+    assert scores[pairs[:, 0], pairs[:, 1]].sum() >= 0.979 * np.triu(scores).sum()
     chosen = np.zeros((n, n), dtype=bool)
     chosen[pairs[:, 0], pairs[:, 1]] = True
     assert (pairs[:, 0] < pairs[:, 1]).all()
@@ -155,8 +155,8 @@ def test_every_image_keeps_its_best_and_all_are_connected(
     chosen |= chosen.T
     for image in range(n):
         others = [other for other in range(n) if other != image]
-        best = sorted((promised[image, other] for other in others), reverse=True)[: min(min_partners, n - 1)]
-        kept = sorted((promised[image, other] for other in others if chosen[image, other]), reverse=True)
+        best = sorted((scores[image, other] for other in others), reverse=True)[: min(min_partners, n - 1)]
+        kept = sorted((scores[image, other] for other in others if chosen[image, other]), reverse=True)
         assert kept[: len(best)] == best
 
 
@@ -166,10 +166,10 @@ def test_third_images_speak_for_pairs_that_chance_left_out() -> None:
     consistent[:4, :4] = consistent[4:, 4:] = 50
     np.fill_diagonal(consistent, 0)
     consistent[0, 1] = consistent[1, 0] = 0
-    promised = promise(consistent + 1 - np.eye(8, dtype=np.int32), consistent)
-    assert promised[0, 1] > 10
-    assert not promised[:4, 4:].any()
-    assert promised[4, 5] > promised[0, 1]
+    scores = pair_scores(consistent + 1 - np.eye(8, dtype=np.int32), consistent)
+    assert scores[0, 1] > 10
+    assert not scores[:4, 4:].any()
+    assert scores[4, 5] > scores[0, 1]
 
 
 def test_strongest_features_grow_with_the_features_within_limits() -> None:
@@ -178,7 +178,7 @@ def test_strongest_features_grow_with_the_features_within_limits() -> None:
     assert num_strongest([30000] * 3) == 1000
 
 
-def test_groups_that_promise_nothing_to_each_other_are_linked_once() -> None:
+def test_groups_without_a_score_between_them_are_linked_once() -> None:
     consistent = np.zeros((10, 10), np.int32)
     consistent[:5, :5] = consistent[5:, 5:] = 50
     np.fill_diagonal(consistent, 0)

@@ -24,7 +24,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(OutputError, match=r"a\.json: No space left on device; make room"):
+    with pytest.raises(OutputError, match=r"a\.json: No space left on device; free disk space"):
         atomic_write(path, "second")
     assert path.read_text() == "first"
     assert list(tmp_path.iterdir()) == [path]

@@ -38,8 +38,8 @@ def test_pairs_between_two_models_are_counted_and_the_strongest_named(solved: tu
         tuple(graph.image_names[i] for i in graph.edges[row]) for row in order[:10]
     ]
     assert not found.firm
-    assert f"the strongest {found.strongest[0].images[0]} and {found.strongest[0].images[1]}" in found.told
-    assert "one more photograph" in found.told
+    assert f"the strongest: {found.strongest[0].images[0]} and {found.strongest[0].images[1]}" in found.told
+    assert "add a photograph" in found.told
 
 
 def test_pairs_that_contradict_the_rest_and_no_pairs_are_told_apart(solved: tuple[ViewGraph, PoseSolution]) -> None:

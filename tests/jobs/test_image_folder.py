@@ -60,7 +60,7 @@ def test_other_options_or_photographs_start_afresh(tmp_path: Path, images: Path)
     log = StageLog()
     make_database(images, tmp_path, replace(OPTIONS, max_num_features=200), log, resume=True)
     assert stages(log) == ["photographs", "features", "matching"]
-    assert "afresh" in log.warnings[0]
+    assert "extracted again" in log.warnings[0]
     (tmp_path / "list.txt").write_text("00.jpg\n01.jpg\n02.jpg\n")
     fewer = replace(OPTIONS, max_num_features=200, image_list_path=tmp_path / "list.txt")
     assert len(make_database(images, tmp_path, fewer, resume=True).image_names) == 3

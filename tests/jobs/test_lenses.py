@@ -101,7 +101,7 @@ def test_a_wrong_focal_length_that_must_stay_stays_with_a_warning(tmp_path: Path
     options = MappingOptions(ba_refine_focal_length=False, ba_refine_extra_params=False)
     result = map_database(tmp_path / "a.db", None, tmp_path / "out", options, log)
     assert list(result.models[0].camera(1).params) == list(stored.params)
-    (told,) = [warning for warning in log.warnings if "kept as asked" in warning]
+    (told,) = [warning for warning in log.warnings if "kept as requested" in warning]
     assert "not the 800.0 px" in told
     free = map_database(tmp_path / "a.db", None, tmp_path / "free", MappingOptions(), StageLog())
     assert abs(free.models[0].camera(1).mean_focal_length() - 600.0) < 6.0
@@ -124,7 +124,7 @@ def test_distortion_that_nobody_told_is_found(focal: float, term: float, prior: 
     found = result.models[0].camera(1)
     assert abs(found.params[3] - term) < 0.01
     assert abs(found.params[0] / focal - 1.0) < 0.01
-    assert any("tells no distortion" in warning for warning in log.warnings) == (term != 0.0)
+    assert any("has no distortion" in warning for warning in log.warnings) == (term != 0.0)
 
 
 def test_poses_without_points_have_the_lens_that_was_found(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_missing_photographs_are_named_and_the_others_used(model: pycolmap.Recon
     assert {tuple(point.color.tolist()) for point in model.points3D.values()} == {COLOR}
     assert len(log.warnings) == 1
     assert log.warnings[0].startswith(
-        f"2 of 4 registered images are not in {folder}, or cannot be read (first: {names[0]})"
+        f"2 of 4 registered images are missing in {folder} or cannot be read (first: {names[0]})"
     )
 
 
@@ -86,7 +86,7 @@ def test_files_of_other_proportions_are_named(model: pycolmap.Reconstruction, tm
     extract_colors(model, folder, log)
     assert {tuple(point.color.tolist()) for point in model.points3D.values()} == {COLOR}
     (warning,) = log.warnings
-    assert warning.startswith("1 of 4 registered images have other proportions")
+    assert warning.startswith("1 of 4 registered images differ in aspect ratio")
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".tif"])

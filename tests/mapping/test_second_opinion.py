@@ -81,7 +81,7 @@ def test_the_ground_tells_equal_sides_apart(num_sides: int, num_ground_points: i
     result = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log)
     assert result.solution.registered.all()
     assert _num_folded(result.solution, views) == 0
-    assert any("images do not see what they should" in warning for warning in log.warnings)
+    assert any("images do not see the points that they should" in warning for warning in log.warnings)
 
 
 def test_nothing_tells_equal_sides_apart_without_a_ground(tmp_path: Path) -> None:

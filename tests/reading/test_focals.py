@@ -9,10 +9,10 @@ from colmap_vg import ReadOptions
 from colmap_vg.reading.read import read_with_caveats
 
 CHANGES = {
-    "in 15 pairs all matches are on one plane": "UPDATE two_view_geometries SET config = 4",
-    "or the camera turned on the spot": "UPDATE two_view_geometries SET config = 5",
+    "in 15 pairs all matches lie on one plane": "UPDATE two_view_geometries SET config = 4",
+    "or the camera only rotated": "UPDATE two_view_geometries SET config = 5",
     "COLMAP found no geometry for the pairs": "UPDATE two_view_geometries SET config = 1",
-    "no pair has the 16 matches": "UPDATE two_view_geometries SET rows = 15, data = substr(data, 1, 120)",
+    "no pair has the required 16 matches": "UPDATE two_view_geometries SET rows = 15, data = substr(data, 1, 120)",
 }
 
 

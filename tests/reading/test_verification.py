@@ -11,7 +11,7 @@ from colmap_vg import MappingOptions, align_positions
 from colmap_vg.colmap_io.tables import read_tables
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.mapper import map_database
-from colmap_vg.reading.verification import with_own_geometries
+from colmap_vg.reading.verification import with_verified_geometries
 
 IDENTITY = np.eye(3).tobytes()
 NUM_IMAGES = 10
@@ -67,7 +67,7 @@ def test_fundamental_matrices_of_other_pairs_are_not_believed(
         " LIMIT 1)"
     )
     path = changed_copy(noisy[0], tmp_path / "b.db", shifted)
-    tables, changed = with_own_geometries(read_tables(path), 0)
+    tables, changed = with_verified_geometries(read_tables(path), 0)
     assert changed.mean() > 0.8
     assert np.isnan(tables.F[changed]).all()
     error, _ = mean_error(path, noisy[1], tmp_path)
@@ -91,17 +91,17 @@ def test_unverified_matches_are_verified(
         values = (len(matches), matches.tobytes(), pair_id)
         statements.append(("UPDATE two_view_geometries SET rows = ?, cols = 2, data = ? WHERE pair_id = ?", values))
     path = changed_copy(noisy[0], tmp_path / "b.db", *statements)
-    verified, changed = with_own_geometries(read_tables(path), 0)
+    verified, changed = with_verified_geometries(read_tables(path), 0)
     assert changed.all()
     removed = tables.offsets[-1] - verified.offsets[-1]
     assert 0.9 * wrong <= removed <= 1.1 * wrong
     error, warnings = mean_error(path, noisy[1], tmp_path)
     assert error < 0.003
-    assert any("matches look unverified" in warning for warning in warnings)
+    assert any("matches were not verified" in warning for warning in warnings)
 
 
 def test_what_explains_its_matches_is_left_alone(noisy: tuple[Path, pycolmap.Reconstruction]) -> None:
     tables = read_tables(noisy[0])
-    same, changed = with_own_geometries(tables, 0)
+    same, changed = with_verified_geometries(tables, 0)
     assert same is tables
     assert not changed.any()

@@ -79,5 +79,5 @@ def test_a_database_of_them_is_read_and_solved(tmp_path):
 def test_what_makes_no_scene_is_an_error():
     with pytest.raises(OptionError, match="3 or more"):
         synthetic_views("street", 2)
-    with pytest.raises(OptionError, match="no layout"):
+    with pytest.raises(OptionError, match="choose one of street"):
         synthetic_views("plane", 20)
