@@ -13,6 +13,7 @@ OutlierFilter = Literal["robust", "1dsfm", "none"]
 RotationAveraging = Literal["robust", "chordal"]
 Quality = Literal["low", "medium", "high", "extreme"]
 CameraMode = Literal["auto", "single", "per_folder", "per_image"]
+Extractor = Literal["opencv", "colmap"]
 Matching = Literal["auto", "exhaustive", "selected", "sequential", "spatial"]
 
 
@@ -100,6 +101,7 @@ class SolveOptions(_Checked):
 class FeatureOptions(_Checked):
     """Options of feature extraction and matching. Features are SIFT, computed on the CPU."""
 
+    features: Extractor = "opencv"  # whose SIFT; both match with one another
     camera_model: str = "SIMPLE_RADIAL"
     camera_params: tuple[float, ...] = ()  # in the order of COLMAP's model, pixels; empty: from EXIF, else guessed
     camera_mode: CameraMode = "auto"  # auto: COLMAP's, which shares a camera only if EXIF data agree

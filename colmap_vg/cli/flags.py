@@ -16,6 +16,7 @@ import typer
 from colmap_vg.cli import colmap_flags
 from colmap_vg.options import (
     CameraMode,
+    Extractor,
     FeatureOptions,
     MappingOptions,
     Matching,
@@ -72,6 +73,9 @@ RefineIntrinsics = Annotated[
 class FeatureFlags:
     """Flags of `FeatureOptions`."""
 
+    features: Annotated[
+        Extractor, typer.Option("--features", help="Whose SIFT features are extracted; both match with one another.")
+    ] = FeatureOptions.features
     camera_model: Annotated[
         str, typer.Option("--camera_model", help="COLMAP camera model of new cameras, such as PINHOLE or OPENCV.")
     ] = FeatureOptions.camera_model

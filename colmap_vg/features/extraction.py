@@ -17,7 +17,7 @@ import pycolmap
 from colmap_vg.errors import ImageFolderError, OptionError
 from colmap_vg.events import StageLog
 from colmap_vg.features.masks import with_masks
-from colmap_vg.features.matching import match_features, restore_names
+from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import (
     MIN_IMAGES,
     Photograph,
@@ -25,6 +25,7 @@ from colmap_vg.features.photographs import (
     find_photographs,
     split_odd_sizes,
 )
+from colmap_vg.features.sift_extraction import extract_sift
 from colmap_vg.features.staging import readable_folder
 from colmap_vg.options import FeatureOptions
 
@@ -244,7 +245,6 @@ def _import_images(
     log: StageLog,
 ) -> tuple[list[str], list[SkippedFile]]:
     """Number images and cameras by name, in one thread: extraction alone numbers them as its threads end."""
-    restore_names(database_path)
     known = _image_names(database_path)
     new = [name for name in names if name not in known]
     if new:
@@ -266,6 +266,23 @@ def _extract(
     options: FeatureOptions,
     log: StageLog,
 ) -> None:
+    extract = extract_sift if options.features == "opencv" else _extract_by_colmap
+    extract(image_path, database_path, names, options, log)
+    with pycolmap.Database.open(database_path) as database:
+        counts = {image.name: database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()}
+    blank = [name for name in names if counts[name] == 0]
+    if blank:
+        log.warn(f"no features were found in {', '.join(blank)}: they cannot be matched")
+    log.result(f"{sum(counts[name] for name in names)} features in {len(names)} photographs")
+
+
+def _extract_by_colmap(
+    image_path: str | PathLike[str],
+    database_path: str | PathLike[str],
+    names: Sequence[str],
+    options: FeatureOptions,
+    log: StageLog,
+) -> None:
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
     extraction.num_threads = options.num_threads
@@ -280,12 +297,6 @@ def _extract(
         pycolmap.extract_features(
             database_path, image_path, part, camera_mode, reader_options, extraction, pycolmap.Device.cpu
         )
-    with pycolmap.Database.open(database_path) as database:
-        counts = {image.name: database.num_keypoints_for_image(image.image_id) for image in database.read_all_images()}
-    blank = [name for name in names if counts[name] == 0]
-    if blank:
-        log.warn(f"no features were found in {', '.join(blank)}: they cannot be matched")
-    log.result(f"{sum(counts[name] for name in names)} features in {len(names)} photographs")
 
 
 def _camera_mode(options: FeatureOptions) -> pycolmap.CameraMode:

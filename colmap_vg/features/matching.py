@@ -1,44 +1,52 @@
-"""Matches of a database's features: of all pairs, of pairs chosen beforehand, of neighbours in time or in space."""
+"""Match and verify a database's features: all pairs of images, or some."""
 
 import os
-import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
+from itertools import combinations
 from os import PathLike
-from pathlib import Path
-from urllib.parse import quote, unquote
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from colmap_vg.errors import ImageFolderError
 from colmap_vg.events import StageLog
-from colmap_vg.features.pair_selection import (
-    num_strongest,
-    preemptive_matches,
-    select_pairs,
-    strongest,
-    strongest_features,
+from colmap_vg.features.pair_matching import (
+    MAX_FIRST_FEATURES,
+    ImageFeatures,
+    PairMatches,
+    match_all_features,
+    match_pair,
+    num_consistent_matches,
 )
-from colmap_vg.features.photographs import MIN_IMAGES
+from colmap_vg.features.pair_selection import strongest
+from colmap_vg.features.pairings import SELECTION_SHARE, selected_pairs, sequential_pairs, spatial_pairs
+from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import FeatureOptions
+from colmap_vg.scene.components import components_by_size
 
-MAX_EXHAUSTIVE = 20
-"""Images; in larger folders ``auto`` chooses pairs before it matches them. Smaller ones have hardly a pair to save."""
-MAX_DISTANCE = 100.0
-"""Metres between the GPS positions of photographs that spatial matching pairs."""
-_PAIRS_PER_CALL = 2000
-"""Pairs per thread and call of pycolmap: progress is told between calls, and each call indexes its images anew."""
-_SELECTING = 0.05
-"""Share of the stage's time that choosing takes, for the progress."""
-_MARK = "colmap_vg-listed:"
-"""Begins names that cannot stand in a list of pairs, while one is matched."""
+MAX_ALL_PAIRS = 20
+"""Images; in larger folders ``auto`` selects pairs before it matches them. Smaller ones have hardly a pair to save."""
+MIN_VERIFIED_PARTNERS = 5
+"""Verified pairs that each image should have; for those with fewer, pairs with few matches are matched in full."""
+_FIRST_SHARE = 0.8
+"""Share of the time of matching that ends with the largest features, for the progress."""
+_PAIRS_PER_BATCH = 16
+"""Pairs per thread that are matched between two writes to the database, from where an interrupted job goes on."""
+_IMAGES_IN_MEMORY = 256
+"""Images whose features are kept between pairs, at 1.2 MB for 8,192 features."""
+
+PairMatcher = Callable[[ImageFeatures, ImageFeatures, pycolmap.TwoViewGeometryOptions], PairMatches]
 
 
 def match_features(database_path: str | PathLike[str], options: FeatureOptions, log: StageLog) -> int:
     """Match the features of a database's images and verify the pairs; pairs that it already holds are kept.
+
+    Parameters
+    ----------
+    database_path : path
+    options : FeatureOptions
+    log : StageLog
 
     Returns
     -------
@@ -51,191 +59,145 @@ def match_features(database_path: str | PathLike[str], options: FeatureOptions, 
         Spatial matching is asked for, and the photographs have no GPS positions.
     """
     with log.stage("matching"):
-        restore_names(database_path)
-        chosen = _match(database_path, options, log)
+        selected = _match(database_path, options, log)
         with pycolmap.Database.open(database_path) as database:
             num_matched = database.num_matched_image_pairs()
             num_verified = sum(count > 0 for count in database.read_two_view_geometry_num_inliers()[1])
-        log.result(f"{num_verified} verified of {num_matched} matched pairs{chosen}")
+        log.result(f"{num_verified} verified of {num_matched} matched pairs{selected}")
     return int(num_verified)
 
 
 def _match(database_path: str | PathLike[str], options: FeatureOptions, log: StageLog) -> str:
-    """Match; what there is to say of the choice of pairs."""
-    matching, verification, device = *_matching_options(options), pycolmap.Device.cpu
-    if options.matching == "sequential":
-        with pycolmap.Database.open(database_path) as database:
-            names = [image.name for image in database.read_all_images()]
-        match_pairs(database_path, sequential_pairs(names, options.sequential_overlap), options, log)
-        return ""
-    if options.matching == "spatial":
-        apart = _without_neighbours(database_path, log)
-        spatial = pycolmap.SpatialPairingOptions()
-        spatial.num_threads, spatial.max_distance = options.num_threads, MAX_DISTANCE
-        pycolmap.match_spatial(database_path, matching, spatial, verification, device)
-        if apart:
-            pairs = promising_pairs(database_path, options.num_threads, log)
-            match_pairs(database_path, [pair for pair in pairs if not apart.isdisjoint(pair)], options, log)
+    """Match pairs as the options say; return what the result says of their selection."""
+    if options.matching == "exhaustive":
+        _match_exhaustively(database_path, options)
         return ""
     with pycolmap.Database.open(database_path) as database:
-        num_images = database.num_images()
-    if options.matching == "exhaustive" or (options.matching == "auto" and num_images <= MAX_EXHAUSTIVE):
-        pairing = pycolmap.ExhaustivePairingOptions()
-        pycolmap.match_exhaustive(database_path, matching, pairing, verification, device)
+        names = sorted(image.name for image in database.read_all_images())
+    if options.matching == "sequential":
+        match_pairs(database_path, sequential_pairs(names, options.sequential_overlap), options, log)
         return ""
-    pairs = promising_pairs(database_path, options.num_threads, log)
-    match_pairs(database_path, pairs, options, log)
-    return f", chosen from {num_images * (num_images - 1) // 2}"
+    if options.matching == "auto" and len(names) <= MAX_ALL_PAIRS:
+        match_pairs(database_path, list(combinations(names, 2)), options, log)
+        return ""
+    threads = _num_threads(options.num_threads)
+    if options.matching == "spatial":
+        pairs, apart = spatial_pairs(database_path, log)
+        if apart:
+            by_features = selected_pairs(database_path, threads, options.random_seed, log)
+            pairs += [pair for pair in by_features if not apart.isdisjoint(pair)]
+        match_pairs(database_path, pairs, options, log)
+        return ""
+    match_pairs(database_path, selected_pairs(database_path, threads, options.random_seed, log), options, log)
+    return f", selected from {len(names) * (len(names) - 1) // 2}"
 
 
-def _matching_options(
-    options: FeatureOptions,
-) -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
+def _match_exhaustively(database_path: str | PathLike[str], options: FeatureOptions) -> None:
+    """Match all features of all pairs by brute force, with pycolmap."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = options.num_threads
+    pairing = pycolmap.ExhaustivePairingOptions()
+    pycolmap.match_exhaustive(database_path, matching, pairing, _verification(options), pycolmap.Device.cpu)
+
+
+def _verification(options: FeatureOptions) -> pycolmap.TwoViewGeometryOptions:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = options.random_seed
-    return matching, verification
+    return verification
 
 
-def _without_neighbours(database_path: str | PathLike[str], log: StageLog) -> set[str]:
-    """Names of images that have no other near by GPS positions: named, and to be matched by their features.
-
-    Raises
-    ------
-    ImageFolderError
-        Fewer than three images have a position.
-    """
-    with pycolmap.Database.open(database_path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        priors = {prior.corr_data_id.id: prior for prior in database.read_all_pose_priors()}
-    located = {image_id: prior for image_id, prior in priors.items() if image_id in names and _is_told(prior.position)}
-    if len(located) < MIN_IMAGES:
-        raise ImageFolderError(
-            f"{len(located)} of {len(names)} photographs have a GPS position; spatial matching needs them:"
-            " use matching='auto'"
-        )
-    positions = np.array([prior.position for prior in located.values()])
-    if all(prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84 for prior in located.values()):
-        positions[:, 2] = 0.0
-        positions = pycolmap.GPSTransform().ellipsoid_to_ecef(positions)
-    nearest = cKDTree(positions).query(positions, 2)[0][:, 1]
-    far = [names[image_id] for image_id, away in zip(located, nearest, strict=True) if away > MAX_DISTANCE]
-    lacking = [name for image_id, name in names.items() if image_id not in located]
-    for apart, why in (
-        (lacking, "have no GPS position"),
-        (far, f"are more than {MAX_DISTANCE:.0f} m away from all others"),
-    ):
-        if apart:
-            log.warn(f"{len(apart)} photographs {why}, and are matched by their features: {', '.join(sorted(apart))}")
-    return {*far, *lacking}
-
-
-def _is_told(position: NDArray[np.float64]) -> bool:
-    """Whether a GPS position is one: receivers without a fix write zeros, in the Gulf of Guinea."""
-    return bool(np.all(np.isfinite(position)) and np.any(position[:2] != 0.0))
-
-
-def promising_pairs(database_path: str | PathLike[str], num_threads: int, log: StageLog) -> list[tuple[str, str]]:
-    """Names of the pairs of a database's images that are worth matching, from their strongest features."""
-    with pycolmap.Database.open(database_path) as database:
-        images = sorted(database.read_all_images(), key=lambda image: image.name)
-        most = num_strongest([database.num_keypoints_for_image(image.image_id) for image in images])
-        keypoints, descriptors = [], []
-        for image in images:
-            own = database.read_keypoints(image.image_id)
-            rows = strongest(own, most)
-            keypoints.append(own[rows])
-            descriptors.append(database.read_descriptors(image.image_id).data[rows])
-    features = strongest_features(keypoints, descriptors)
-    counts = preemptive_matches(
-        features, _num_threads(num_threads), lambda done: log.progress("choosing pairs", _SELECTING * done)
-    )
-    return [(images[first].name, images[second].name) for first, second in select_pairs(*counts)]
-
-
-def sequential_pairs(names: Sequence[str], overlap: int) -> list[tuple[str, str]]:
-    """Pairs of each image with those that follow it, and with others at growing distances.
-
-    Parameters
-    ----------
-    names : sequence of str
-        In any order. Numbers in them count as numbers: frame2 comes before frame10.
-    overlap : int
-        Images that follow, and powers of two from 1 on at whose distances others are taken.
-
-    Returns
-    -------
-    list of (str, str)
-    """
-    ordered = sorted(names, key=_natural)
-    distances = sorted({*range(1, overlap + 1), *(2**power for power in range(overlap) if 2**power < len(ordered))})
-    return [
-        (name, ordered[place + distance])
-        for place, name in enumerate(ordered)
-        for distance in distances
-        if place + distance < len(ordered)
-    ]
-
-
-def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Key by which runs of digits sort as numbers, before letters; equal numbers by the name as it is."""
-    parts = [part for part in re.split(r"([0-9]+)", name) if part]
-    return [(0, int(part), "") if part.isdecimal() and part.isascii() else (1, 0, part) for part in parts], name
-
-
+@single_threaded_blas
 def match_pairs(
     database_path: str | PathLike[str], pairs: Sequence[tuple[str, str]], options: FeatureOptions, log: StageLog
 ) -> None:
-    """Match and verify the given pairs of names; those that the database already holds are kept."""
-    matching, verification = _matching_options(options)
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = Path(f"{os.fspath(database_path)}-pairs.txt")
-    step = _PAIRS_PER_CALL * _num_threads(options.num_threads)
-    with _names_for_lists(database_path) as listed:
-        try:
-            for start in range(0, len(pairs), step):
-                share = _SELECTING + (1.0 - _SELECTING) * start / len(pairs)
-                log.progress(f"{start} of {len(pairs)} pairs", share)
-                lines = [f"{listed[first]} {listed[second]}\n" for first, second in pairs[start : start + step]]
-                pairing.match_list_path.write_text("".join(lines), encoding="utf-8")
-                pycolmap.match_image_pairs(database_path, matching, pairing, verification, pycolmap.Device.cpu)
-        finally:
-            pairing.match_list_path.unlink(missing_ok=True)
+    """Match and verify the given pairs of image names; pairs that the database already holds are kept.
 
-
-@contextmanager
-def _names_for_lists(database_path: str | PathLike[str]) -> Iterator[dict[str, str]]:
-    """Names of images as a list of pairs may hold them; COLMAP ends a name at a blank, without a word.
-
-    Those that may not are another for as long, in a form from which :func:`restore_names` brings them back.
+    Pairs that their largest features do not verify are matched in full where an image has few verified pairs, or where
+    they would connect images that no verified pairs connect.
     """
     with pycolmap.Database.open(database_path) as database:
+        matcher = _Matcher(database, options)
+        ids = matcher.image_ids
+        by_id = [(ids[first], ids[second]) for first, second in pairs]
+        todo = [pair for pair in by_id if not matcher.is_matched(*pair)]
+        for done in matcher.match(match_pair, todo):
+            share = SELECTION_SHARE + (_FIRST_SHARE - SELECTION_SHARE) * done / len(todo)
+            log.progress(f"{done} of {len(todo)} pairs", share)
+        weak = matcher.weak_pairs(by_id)
+        for done in matcher.match(match_all_features, weak):
+            share = _FIRST_SHARE + (1.0 - _FIRST_SHARE) * done / len(weak)
+            log.progress(f"{done} of {len(weak)} pairs with few matches", share)
+
+
+class _Matcher:
+    """Matches pairs of a database's images in threads; reads and writes in one."""
+
+    def __init__(self, database: pycolmap.Database, options: FeatureOptions) -> None:
+        self._database, self._verification = database, _verification(options)
+        self._workers = _num_threads(options.num_threads)
         images = database.read_all_images()
-        listed = {image.name: _listed(image.name) for image in images}
-        for image in images:
-            if listed[image.name] != image.name:
-                image.name = listed[image.name]
-                database.update_image(image)
-    try:
-        yield listed
-    finally:
-        restore_names(database_path)
+        self.image_ids = {image.name: image.image_id for image in images}
+        self._cameras = {image.image_id: database.read_camera(image.camera_id) for image in images}
+        self._features = lru_cache(_IMAGES_IN_MEMORY)(self._read_features)
+
+    def _read_features(self, image_id: int) -> ImageFeatures:
+        keypoints = self._database.read_keypoints(image_id)
+        descriptors = self._database.read_descriptors(image_id).data
+        return ImageFeatures(self._cameras[image_id], keypoints, descriptors, strongest(keypoints, MAX_FIRST_FEATURES))
+
+    def is_matched(self, first: int, second: int) -> bool:
+        """Whether the database holds the pair, verified or not."""
+        database = self._database
+        return bool(database.exists_matches(first, second) and database.exists_two_view_geometry(first, second))
+
+    def match(self, how: PairMatcher, pairs: Sequence[tuple[int, int]]) -> Iterator[int]:
+        """Match pairs and write what is found; yields how many pairs are done."""
+        size = _PAIRS_PER_BATCH * self._workers
+        with ThreadPoolExecutor(self._workers) as pool:
+            for start in range(0, len(pairs), size):
+                yield start
+                batch = pairs[start : start + size]
+                images = [(self._features(first), self._features(second)) for first, second in batch]
+                for pair, found in zip(
+                    batch, pool.map(partial(_matched, how, self._verification), images), strict=True
+                ):
+                    self._write(*pair, found)
+
+    def weak_pairs(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Pairs without a verified geometry whose matches agree beyond chance, where images need more pairs."""
+        inliers = dict(zip(*self._database.read_two_view_geometry_num_inliers(), strict=True))
+        found = [inliers.get(pycolmap.image_pair_to_pair_id(*pair), 0) for pair in pairs]
+        verified = np.array(found, dtype=np.int64) > 0
+        rows = {image_id: row for row, image_id in enumerate(self._cameras)}
+        edges = np.array([(rows[first], rows[second]) for first, second in pairs], dtype=np.int64).reshape(-1, 2)
+        partners = np.bincount(edges[verified].ravel(), minlength=len(rows))
+        part = components_by_size(len(rows), edges[verified])
+        needed = (partners[edges] < MIN_VERIFIED_PARTNERS).any(axis=1) | (part[edges[:, 0]] != part[edges[:, 1]])
+        weak = [pairs[row] for row in np.flatnonzero(needed & ~verified).tolist()]
+        return [pair for pair in weak if self._agrees(*pair)]
+
+    def _agrees(self, first: int, second: int) -> bool:
+        images = self._features(first), self._features(second)
+        if not any(image.has_more for image in images):
+            return False  # all features are matched already
+        matches = np.asarray(self._database.read_matches(first, second), dtype=np.int64).reshape(-1, 2)
+        return num_consistent_matches(*images, matches) > 0
+
+    def _write(self, first: int, second: int, found: PairMatches) -> None:
+        """Write a pair, in place of what the database holds of it."""
+        if self._database.exists_matches(first, second):
+            self._database.delete_matches(first, second)
+        if self._database.exists_two_view_geometry(first, second):
+            self._database.delete_two_view_geometry(first, second)
+        self._database.write_matches(first, second, found.matches.astype(np.uint32))
+        self._database.write_two_view_geometry(first, second, found.geometry)
 
 
-def _listed(name: str) -> str:
-    fits = name.isprintable() and not any(letter.isspace() for letter in name) and not name.startswith(("#", _MARK))
-    return name if fits else _MARK + quote(name)
-
-
-def restore_names(database_path: str | PathLike[str]) -> None:
-    """Give images their names back that a job killed while it matched a list of pairs left behind under others."""
-    with pycolmap.Database.open(database_path) as database:
-        for image in database.read_all_images():
-            if image.name.startswith(_MARK):
-                image.name = unquote(image.name.removeprefix(_MARK))
-                database.update_image(image)
+def _matched(
+    how: PairMatcher, verification: pycolmap.TwoViewGeometryOptions, images: tuple[ImageFeatures, ImageFeatures]
+) -> PairMatches:
+    return how(*images, verification)
 
 
 def _num_threads(num_threads: int) -> int:

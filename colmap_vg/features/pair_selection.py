@@ -4,9 +4,6 @@ Features of the largest scales are few and stable, so pairs that see the same ob
 (C. Wu, Towards Linear-Time Incremental Structure from Motion, 3DV 2013, section 3). Matches by chance are recognised by
 weak geometric consistency (Jégou, Douze and Schmid, ECCV 2008): correct matches of a pair agree on the rotation and the
 change of scale between the images, wrong ones do not.
-
-Descriptors are bytes, and their products, sums of 128 integers below 2**16, are exact in single precision, so the
-result does not depend on the BLAS library, its threads or the order of the pairs.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,29 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 
+from colmap_vg.features.nearest_descriptors import mutual_matches
+from colmap_vg.features.orientation_votes import excess_over_chance, log2_scales, num_agreeing, orientations
 from colmap_vg.linear.threads import single_threaded_blas
 
 STRONGEST_SHARE = 8
 """One in this many of the median image's features is matched preemptively."""
 STRONGEST_LIMITS = (300, 1000)
 """Minimum and maximum number of features per image that are matched preemptively."""
-_MAX_RATIO = 0.8
-"""Maximum ratio of the distances to the nearest and the second nearest descriptor, as in the full matching."""
-_SQUARED_NORM = 512.0**2
-"""Squared norm of descriptors as COLMAP stores them: unit vectors times 512, rounded to bytes."""
-_ROTATION_BINS = 12
-"""Number of bins of the rotation between two images, 30 degrees each."""
-_SCALE_BINS = 10
-"""Number of bins of the change of scale, one octave each; the first and the last also count what is beyond them."""
-_CHANCE = 0.2
-"""Share of wrong matches that agree by chance, since some scales and the same image orientation are frequent."""
 _KEPT = 0.98
 """Share of the sum of all pair scores to reach; in four scenes the selected pairs had 97 to 99.9 % of the inlier
 matches."""
 MIN_PARTNERS = 8
 """Minimum number of images with which each image is matched, whatever the pair scores."""
+MAX_PARTNERS = 90
+"""Number of images beyond which more add time and hardly accuracy: without it the pairs of a folder in which all see
+the same grow with the square of their number."""
 
-FloatArray = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 CountArray = NDArray[np.int32]
 
@@ -79,7 +70,7 @@ def strongest(keypoints: NDArray[np.float32], most: int) -> IntArray:
     most : int
         Maximum number of rows.
     """
-    return np.argsort(-_log2_scales(keypoints), kind="stable")[:most]
+    return np.argsort(-log2_scales(keypoints), kind="stable")[:most]
 
 
 def strongest_features(keypoints: list[NDArray[np.float32]], descriptors: list[NDArray[np.uint8]]) -> StrongestFeatures:
@@ -87,25 +78,22 @@ def strongest_features(keypoints: list[NDArray[np.float32]], descriptors: list[N
     most = max((len(own) for own in keypoints), default=0)
     width = max((own.shape[1] for own in descriptors), default=0)
     block = np.zeros((len(keypoints), most, width), np.uint8)
-    scales, orientations = np.zeros(block.shape[:2]), np.zeros(block.shape[:2])
+    scales, turns = np.zeros(block.shape[:2]), np.zeros(block.shape[:2])
     for image, (points, bytes_) in enumerate(zip(keypoints, descriptors, strict=True)):
         block[image, : len(points), : bytes_.shape[1]] = bytes_
-        scales[image, : len(points)] = _log2_scales(points)
-        orientations[image, : len(points)] = np.arctan2(points[:, 4], points[:, 2])
-    return StrongestFeatures(block, scales, orientations)
-
-
-def _log2_scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
-    shape = keypoints[:, 2:6].astype(np.float64)
-    area = np.abs(shape[:, 0] * shape[:, 3] - shape[:, 1] * shape[:, 2])
-    return np.asarray(0.5 * np.log2(np.maximum(area, np.finfo(np.float32).tiny)))
+        scales[image, : len(points)] = log2_scales(points)
+        turns[image, : len(points)] = orientations(points)
+    return StrongestFeatures(block, scales, turns)
 
 
 @single_threaded_blas
 def preemptive_matches(
-    features: StrongestFeatures, num_threads: int, on_progress: Callable[[float], None] = lambda _: None
+    features: StrongestFeatures,
+    num_threads: int,
+    on_progress: Callable[[float], None] = lambda _: None,
+    candidates: NDArray[np.bool_] | None = None,
 ) -> tuple[CountArray, CountArray]:
-    """Match the strongest features of all pairs of images.
+    """Match the strongest features of pairs of images.
 
     Parameters
     ----------
@@ -114,25 +102,26 @@ def preemptive_matches(
         Number of threads, each with one BLAS thread; the result does not depend on it.
     on_progress : callable, optional
         Called with the share of pairs that are done.
+    candidates : (n, n) bool array, optional
+        Pairs to match; symmetric. Missing: all pairs.
 
     Returns
     -------
     num_matches : (n, n) int32 array
-        Mutually nearest features that pass the ratio test; symmetric.
+        Mutually nearest features that pass the ratio test; symmetric, 0 for other pairs.
     num_consistent : (n, n) int32 array
         The largest number of them that agree on a rotation within 60 degrees and a change of scale within two octaves;
         symmetric.
     """
     n = len(features.descriptors)
+    candidates = ~np.eye(n, dtype=bool) if candidates is None else candidates
     matches, consistent = np.zeros((n, n), np.int32), np.zeros((n, n), np.int32)
 
     def match_with_later(first: int) -> None:
-        descriptors = features.descriptors[first].astype(np.float32)
-        products = np.empty((len(descriptors), len(descriptors)), np.float32)
-        for second in range(first + 1, n):
-            rows, columns = mutual_matches(descriptors, features.descriptors[second].astype(np.float32), products)
+        for second in (first + 1 + np.flatnonzero(candidates[first, first + 1 :])).tolist():
+            rows, columns = mutual_matches(features.descriptors[first], features.descriptors[second]).T
             matches[first, second] = matches[second, first] = len(rows)
-            consistent[first, second] = consistent[second, first] = _most_consistent(
+            consistent[first, second] = consistent[second, first] = num_agreeing(
                 features.orientations[first, rows] - features.orientations[second, columns],
                 features.log2_scales[first, rows] - features.log2_scales[second, columns],
             )
@@ -140,45 +129,9 @@ def preemptive_matches(
     with ThreadPoolExecutor(num_threads) as pool:
         done = 0
         for first, _ in enumerate(pool.map(match_with_later, range(n))):
-            done += n - 1 - first
-            on_progress(done / max(n * (n - 1) // 2, 1))
+            done += int(candidates[first, first + 1 :].sum())
+            on_progress(2.0 * done / max(int(candidates.sum()), 1))
     return matches, consistent
-
-
-def mutual_matches(
-    first: FloatArray, second: FloatArray, products: FloatArray | None = None
-) -> tuple[IntArray, IntArray]:
-    """Rows of two sets of descriptors that are mutual nearest neighbours and pass the ratio test.
-
-    Parameters
-    ----------
-    first, second : (h, d), (k, d) arrays
-        Descriptors of norm near 512; rows of zeros match nothing.
-    products : (h, k) array, optional
-        Buffer for the products; to allocate one per pair takes as long as the products themselves.
-    """
-    if not len(first) or not len(second):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    products = np.matmul(first, second.T, out=products)
-    nearest = products.argmax(axis=1)
-    best = products[np.arange(len(first)), nearest]
-    rows = np.flatnonzero(products.max(axis=0)[nearest] == best)  # argmax along columns would take far longer
-    columns, best = nearest[rows], best[rows]
-    products[rows, columns] = 0.0
-    rivals = products.max(axis=1)[rows]
-    # Squared distances of unit vectors are 2 - 2 cos; deviations of the norm by rounding are negligible.
-    passed = _SQUARED_NORM - best < _MAX_RATIO**2 * (_SQUARED_NORM - rivals)
-    return rows[passed], columns[passed]
-
-
-def _most_consistent(turned: NDArray[np.float64], scaled: NDArray[np.float64]) -> int:
-    """Largest number of votes in two by two adjacent bins of rotation, which is cyclic, and scale."""
-    rotation = np.floor(turned * (_ROTATION_BINS / (2 * np.pi))).astype(np.int64) % _ROTATION_BINS
-    scale = np.clip(np.floor(scaled).astype(np.int64) + _SCALE_BINS // 2, 0, _SCALE_BINS - 1)
-    votes = np.bincount(rotation * _SCALE_BINS + scale, minlength=_ROTATION_BINS * _SCALE_BINS)
-    votes = votes.reshape(_ROTATION_BINS, _SCALE_BINS)
-    votes = votes + np.roll(votes, 1, axis=0)
-    return int((votes[:, 1:] + votes[:, :-1]).max())
 
 
 def pair_scores(num_matches: CountArray, num_consistent: CountArray) -> NDArray[np.float64]:
@@ -198,8 +151,7 @@ def pair_scores(num_matches: CountArray, num_consistent: CountArray) -> NDArray[
     (n, n) array
         Scores, in matches; symmetric.
     """
-    by_chance = _CHANCE * num_matches
-    excess = np.maximum(num_consistent - by_chance - 2.0 * np.sqrt(by_chance), 0.0)
+    excess = excess_over_chance(num_consistent, num_matches)
     degree = excess.sum(axis=0) + 1.0
     linked = excess / np.sqrt(np.outer(degree, degree))
     through_others = linked @ linked
@@ -210,7 +162,12 @@ def pair_scores(num_matches: CountArray, num_consistent: CountArray) -> NDArray[
 
 
 @single_threaded_blas
-def select_pairs(num_matches: CountArray, num_consistent: CountArray, min_partners: int = MIN_PARTNERS) -> IntArray:
+def select_pairs(
+    num_matches: CountArray,
+    num_consistent: CountArray,
+    min_partners: int = MIN_PARTNERS,
+    max_partners: int = MAX_PARTNERS,
+) -> IntArray:
     """Select the pairs of images to match with all features.
 
     These are the pairs with the highest scores, up to nearly the sum of all scores; the best partners of each image;
@@ -222,6 +179,8 @@ def select_pairs(num_matches: CountArray, num_consistent: CountArray, min_partne
         From :func:`preemptive_matches`.
     min_partners : int
         Minimum number of pairs of each image.
+    max_partners : int
+        Pairs that are among so many best of neither image are left out.
 
     Returns
     -------
@@ -247,5 +206,7 @@ def select_pairs(num_matches: CountArray, num_consistent: CountArray, min_partne
     np.fill_diagonal(ranks, len(first) + 1)
     limit = np.sort(ranks, axis=1)[:, min(min_partners, n - 1) - 1]
     chosen |= ranks <= np.maximum(limit[:, None], limit[None, :])
+    limit = np.sort(ranks, axis=1)[:, min(max_partners, n - 1) - 1]
+    chosen &= ranks <= np.maximum(limit[:, None], limit[None, :])
     np.fill_diagonal(chosen, False)
     return np.argwhere(np.triu(chosen)).astype(np.int64)

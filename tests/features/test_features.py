@@ -1,5 +1,6 @@
 """Photographs are checked before anything is extracted, and the database holds what pycolmap alone would put there."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,8 +11,10 @@ from rendered_corner import HEIGHT, WIDTH, Corner, render_corner, write_jpeg
 
 from colmap_vg.errors import ImageFolderError, OptionError
 from colmap_vg.events import StageLog
-from colmap_vg.features.extraction import extract_and_match, read_image_list
+from colmap_vg.features.extraction import extract_and_match, extract_features, read_image_list
+from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import Photograph, find_photographs, split_odd_sizes
+from colmap_vg.features.sift_extraction import extract_sift
 from colmap_vg.options import FeatureOptions
 
 QUICK = {"num_threads": 2, "max_num_features": 500, "max_image_size": 240}
@@ -111,10 +114,31 @@ def test_keypoints_are_in_stored_pixels_whatever_the_exif_orientation(tmp_path: 
         assert np.mean(distances < 1.0) > 0.9, name
 
 
+def test_features_of_opencv_and_colmap_match(tmp_path: Path, corner: Corner) -> None:
+    corner.write(tmp_path / "images")
+    path, names = tmp_path / "a.db", sorted(file.name for file in (tmp_path / "images").iterdir())
+    pycolmap.Database.open(path).close()
+    pycolmap.import_images(path, tmp_path / "images")
+    options, log = FeatureOptions(num_threads=2), StageLog()
+    with log.stage("features"):
+        extract_sift(tmp_path / "images", path, names[1:2], options, log)
+    first = database_rows(path)[names[1]][1]
+    assert len(first) > 1000
+    extract_features(tmp_path / "images", path, names, replace(options, features="colmap"), log)
+    rows = database_rows(path)
+    np.testing.assert_array_equal(rows[names[1]][1], first)
+    assert len(rows[names[2]][1]) > 100
+    match_features(path, options, log)
+    with pycolmap.Database.open(path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        mixed = [database.read_two_view_geometry(ids[names[1]], ids[name]) for name in (names[0], names[2])]
+    assert all(len(geometry.inlier_matches) >= 100 for geometry in mixed)
+
+
 def test_database_is_pycolmaps_own_and_numbered_by_name(tmp_path: Path, corner: Corner) -> None:
     corner.write(tmp_path / "images")
     write_jpeg(tmp_path / "images" / "folder.jpg", corner.images[1], focal_35mm=28)
-    result = extract_and_match(tmp_path / "images", tmp_path / "ours.db", FeatureOptions(**QUICK))
+    result = extract_and_match(tmp_path / "images", tmp_path / "ours.db", FeatureOptions(features="colmap", **QUICK))
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.max_image_size = 1, QUICK["max_image_size"]
     options.sift.max_num_features = QUICK["max_num_features"]

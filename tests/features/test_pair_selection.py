@@ -8,7 +8,6 @@ from scipy.sparse.csgraph import connected_components
 
 from colmap_vg.features.pair_selection import (
     StrongestFeatures,
-    mutual_matches,
     num_strongest,
     pair_scores,
     preemptive_matches,
@@ -55,25 +54,6 @@ def test_the_strongest_are_the_largest_whatever_their_orientation() -> None:
     assert scales[chosen].tolist() == [50, 49, 48, 47, 46, 45, 44]
 
 
-def test_matches_are_those_of_brute_force_in_whole_numbers() -> None:
-    rng = np.random.default_rng(1)
-    first = random_descriptors(rng, 80)
-    second = np.concatenate([np.clip(first[:50] + rng.normal(0, 12, (50, 128)), 0, 255), random_descriptors(rng, 30)])
-    second = second.astype(np.uint8)
-    products = first.astype(np.int64) @ second.T.astype(np.int64)
-    expected = []
-    for row in range(80):
-        column = int(np.argmax(products[row]))
-        if int(np.argmax(products[:, column])) != row:
-            continue
-        rival = max(products[row, other] for other in range(80) if other != column)
-        if 512**2 - products[row, column] < 0.64 * (512**2 - rival):
-            expected.append((row, column))
-    found = mutual_matches(first.astype(np.float32), second.astype(np.float32))
-    assert list(zip(*map(np.ndarray.tolist, found), strict=True)) == expected
-    assert len(expected) > 40
-
-
 def test_pairs_that_overlap_have_matches_that_agree() -> None:
     matches, consistent = preemptive_matches(street(12, 2), 1)
     gap = np.abs(np.subtract.outer(np.arange(12), np.arange(12)))
@@ -108,6 +88,25 @@ def test_the_result_does_not_depend_on_threads() -> None:
     features = street(10, 4)
     for one, many in zip(preemptive_matches(features, 1), preemptive_matches(features, 4), strict=True):
         np.testing.assert_array_equal(one, many)
+
+
+def test_only_candidates_are_matched() -> None:
+    features, candidates = street(10, 4), np.zeros((10, 10), dtype=bool)
+    candidates[[2, 3, 4, 9], [3, 2, 9, 4]] = True
+    every, some = preemptive_matches(features, 1), preemptive_matches(features, 1, candidates=candidates)
+    for of_all, of_some in zip(every, some, strict=True):
+        np.testing.assert_array_equal(of_some, np.where(candidates, of_all, 0))
+
+
+def test_no_image_has_more_partners_than_are_of_use() -> None:
+    n = 40
+    matches = np.full((n, n), 100, np.int32)
+    near = 100 - np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    chosen = select_pairs(matches, near.astype(np.int32), min_partners=2, max_partners=6)
+    partners = np.bincount(chosen.ravel(), minlength=n)
+    assert len(chosen) <= 6 * n
+    assert partners.min() >= 3
+    assert np.abs(chosen[:, 0] - chosen[:, 1]).max() <= 6  # the best are kept
 
 
 def test_images_with_few_or_no_features_do_no_harm() -> None:

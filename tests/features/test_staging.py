@@ -60,7 +60,7 @@ def test_exif_goes_into_copies(tmp_path, images):
         write_jpeg(folder / f"{k}.jpg", image, orientation=6, focal_35mm=41)
         pixels, kinds, metadata = cv2.imreadWithMetadata(str(folder / f"{k}.jpg"), stored)
         cv2.imwriteWithMetadata(str(folder / f"{k}.webp"), pixels, kinds, metadata, [cv2.IMWRITE_WEBP_QUALITY, 101])
-    extract_and_match(folder, tmp_path / "a.db", FeatureOptions(**QUICK))
+    extract_and_match(folder, tmp_path / "a.db", FeatureOptions(features="colmap", **QUICK))  # one decoder for both
     found = _features(tmp_path / "a.db")
     for k in range(len(images)):
         jpeg, webp = found[f"{k}.jpg"], found[f"{k}.webp"]

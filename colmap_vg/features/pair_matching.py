@@ -1,0 +1,186 @@
+"""Match two images: their largest features first, and along epipolar lines what is left.
+
+Features of the largest scales are few and the most repeatable. They are matched by brute force, and where they verify
+an epipolar geometry, all features are matched near its lines: of 8,192 features a twentieth of the products. Pairs on
+one plane, whose epipolar lines are undetermined, are matched by brute force in full.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.features.nearest_descriptors import epipolar_matches, mutual_matches
+from colmap_vg.features.orientation_votes import excess_over_chance, log2_scales, num_agreeing, orientations
+
+MAX_FIRST_FEATURES = 2048
+"""Features of each image that are matched first, those of largest scale."""
+MIN_CONSISTENT = 10
+"""Matches that agree on a rotation and a change of scale, below which verification is not tried. It takes 15 inliers;
+perspective takes a third out of two by two bins at most."""
+CONFIRMING_TRIALS = 20
+"""RANSAC trials at least, in place of 100, for matches that one geometry has selected."""
+MIN_EPIPOLAR_ERROR_PX = 1.0
+"""Pixels from the epipolar line within which features are matched at least: a geometry from few matches is so exact."""
+MAX_EPIPOLAR_ERROR_PX = 4.0
+"""The same at most: what RANSAC accepts as an inlier."""
+_RESIDUALS_IN_BOUND = 4.5
+"""Median residuals of the first inliers in the bound on others: three standard deviations of normal errors."""
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFeatures:
+    """Features of an image, and the camera that took it.
+
+    Attributes
+    ----------
+    camera : pycolmap.Camera
+    keypoints : (k, 6) float32 array
+        x, y in pixels, and the affine shape.
+    descriptors : (k, 128) uint8 array
+    largest : (h,) int64 array
+        Rows of the features that are matched first.
+    """
+
+    camera: pycolmap.Camera
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    largest: IntArray
+
+    @property
+    def points(self) -> Array:
+        """Keypoints (k, 2), pixels."""
+        return np.ascontiguousarray(self.keypoints[:, :2], dtype=np.float64)
+
+    @property
+    def has_more(self) -> bool:
+        """Whether there are features beyond those that are matched first."""
+        return len(self.largest) < len(self.keypoints)
+
+
+@dataclass(frozen=True, eq=False)
+class PairMatches:
+    """Matches (k, 2) of two images, and the two-view geometry with those that it verifies."""
+
+    matches: IntArray
+    geometry: pycolmap.TwoViewGeometry
+
+
+def match_pair(first: ImageFeatures, second: ImageFeatures, options: pycolmap.TwoViewGeometryOptions) -> PairMatches:
+    """Match and verify two images by their largest features, and by all where these agree.
+
+    Parameters
+    ----------
+    first, second : ImageFeatures
+    options : pycolmap.TwoViewGeometryOptions
+        Of the verification.
+
+    Returns
+    -------
+    PairMatches
+        Its matches are those of the largest features, and those that were found near epipolar lines.
+    """
+    of_largest = mutual_matches(first.descriptors[first.largest], second.descriptors[second.largest])
+    matches = np.stack([first.largest[of_largest[:, 0]], second.largest[of_largest[:, 1]]], axis=1)
+    if num_consistent_matches(first, second, matches) < MIN_CONSISTENT:
+        return PairMatches(matches, pycolmap.TwoViewGeometry())
+    geometry = _verified(first, second, matches, options)
+    if not len(geometry.inlier_matches):
+        return PairMatches(matches, geometry)
+    if not first.has_more and not second.has_more:
+        return PairMatches(matches, geometry)
+    if not _determines_lines(geometry):
+        return match_all_features(first, second, options)
+    near_lines = _near_lines(first, second, geometry)
+    tried = np.isin(near_lines[:, 0], first.largest) & np.isin(near_lines[:, 1], second.largest)
+    matches = _joined(matches, np.asarray(geometry.inlier_matches, dtype=np.int64), near_lines[~tried])
+    found = _verified(first, second, matches, _confirming(options))
+    if len(found.inlier_matches) < len(geometry.inlier_matches):
+        return PairMatches(matches, geometry)
+    return PairMatches(matches, found)
+
+
+def _joined(matches: IntArray, inliers: IntArray, near_lines: IntArray) -> IntArray:
+    """Matches of the largest features, and those near lines of features that are in no inlier match of these."""
+    new = ~np.isin(near_lines[:, 0], inliers[:, 0]) & ~np.isin(near_lines[:, 1], inliers[:, 1])
+    old = ~np.isin(matches[:, 0], near_lines[new, 0]) & ~np.isin(matches[:, 1], near_lines[new, 1])
+    joined = np.concatenate([matches[old], near_lines[new]])
+    return np.asarray(joined[np.argsort(joined[:, 0], kind="stable")])
+
+
+def match_all_features(
+    first: ImageFeatures, second: ImageFeatures, options: pycolmap.TwoViewGeometryOptions
+) -> PairMatches:
+    """Match all features of two images by brute force, and verify them; parameters as for :func:`match_pair`."""
+    matches = mutual_matches(first.descriptors, second.descriptors)
+    return PairMatches(matches, _verified(first, second, matches, options))
+
+
+def num_consistent_matches(first: ImageFeatures, second: ImageFeatures, matches: IntArray) -> int:
+    """Number of matches that agree on a rotation and a change of scale, if more do than false ones would; else 0."""
+    a, b = first.keypoints[matches[:, 0]], second.keypoints[matches[:, 1]]
+    agreeing = num_agreeing(orientations(a) - orientations(b), log2_scales(a) - log2_scales(b))
+    return agreeing if excess_over_chance(np.array(agreeing), np.array(len(matches))) > 0.0 else 0
+
+
+def _confirming(options: pycolmap.TwoViewGeometryOptions) -> pycolmap.TwoViewGeometryOptions:
+    """Options for matches that one geometry has selected, nearly all of which are inliers."""
+    confirming = pycolmap.TwoViewGeometryOptions(**options.todict(recursive=False))
+    confirming.ransac.min_num_trials = CONFIRMING_TRIALS
+    return confirming
+
+
+def _verified(
+    first: ImageFeatures, second: ImageFeatures, matches: IntArray, options: pycolmap.TwoViewGeometryOptions
+) -> pycolmap.TwoViewGeometry:
+    """Verify matches; RANSAC need not find a share of inliers that makes less than the least number of them."""
+    if len(matches) < options.min_num_inliers:
+        return pycolmap.TwoViewGeometry()
+    options = pycolmap.TwoViewGeometryOptions(**options.todict(recursive=False))
+    options.ransac.min_inlier_ratio = max(options.ransac.min_inlier_ratio, options.min_num_inliers / len(matches))
+    return pycolmap.estimate_two_view_geometry(
+        first.camera, first.points, second.camera, second.points, matches.astype(np.uint32), options
+    )
+
+
+def _determines_lines(geometry: pycolmap.TwoViewGeometry) -> bool:
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    if geometry.config == kinds.CALIBRATED:
+        return geometry.E is not None
+    return geometry.config == kinds.UNCALIBRATED and geometry.F is not None
+
+
+def _near_lines(first: ImageFeatures, second: ImageFeatures, geometry: pycolmap.TwoViewGeometry) -> IntArray:
+    """Matches near the lines of an essential matrix, whose cameras have distortion, or of a fundamental matrix."""
+    points, matrix, pixel = [first.points, second.points], np.asarray(geometry.F), 1.0
+    inliers = np.asarray(geometry.inlier_matches, dtype=np.int64)
+    if geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED:
+        points = [
+            np.asarray(image.camera.cam_from_img(at), dtype=np.float64).reshape(-1, 2)
+            for image, at in zip((first, second), points, strict=True)
+        ]
+        matrix, pixel = np.asarray(geometry.E), 1.0 / second.camera.mean_focal_length()
+    seen = [np.flatnonzero(np.isfinite(at).all(axis=1)) for at in points]
+    errors = _distances(matrix, points[0][inliers[:, 0]], points[1][inliers[:, 1]])
+    bound = _RESIDUALS_IN_BOUND * float(np.nanmedian(errors)) if len(errors) else 0.0
+    bound = float(np.clip(bound, MIN_EPIPOLAR_ERROR_PX * pixel, MAX_EPIPOLAR_ERROR_PX * pixel))
+    matches = epipolar_matches(
+        matrix,
+        points[0][seen[0]],
+        points[1][seen[1]],
+        first.descriptors[seen[0]],
+        second.descriptors[seen[1]],
+        bound,
+    )
+    return np.stack([seen[0][matches[:, 0]], seen[1][matches[:, 1]]], axis=1)
+
+
+def _distances(F: Array, points1: Array, points2: Array) -> Array:
+    """Distances (k,) of points of image 2 from the epipolar lines of their matches."""
+    lines = np.concatenate([points1, np.ones((len(points1), 1))], axis=1) @ np.asarray(F).T
+    off = np.sum(lines[:, :2] * points2, axis=1) + lines[:, 2]
+    return np.asarray(np.abs(off) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), np.finfo(float).tiny))
