@@ -178,7 +178,7 @@ def rendered_folder(parent: Path, size: int) -> Path:
     """A folder with rendered images and ground_truth.txt."""
     folder = parent / f"rendered-{size}"
     (folder / "images").mkdir(parents=True)
-    cameras = render_photographs(folder / "images", num_images=size)
+    cameras = render_photographs(folder / "images", num_images=size, num_threads=-1)
     numbers = np.concatenate([cameras.rotations.reshape(-1, 9), cameras.centers], axis=1).tolist()
     rows = zip(cameras.names, numbers, strict=True)
     (folder / "ground_truth.txt").write_text("".join(f"{n} {' '.join(map(repr, row))}\n" for n, row in rows))

@@ -107,7 +107,7 @@ def run_demo(
     output, log = Path(output_path), StageLog(on_event)
     image_path = output / "images"
     with output_lock(output):
-        cameras = _photographs(output, num_images, seed, log, overwrite=overwrite, resume=resume)
+        cameras = _photographs(output, num_images, seed, num_threads, log, overwrite=overwrite, resume=resume)
         features = FeatureOptions(num_threads=num_threads, random_seed=seed)
         make_database(image_path, output, features, log, overwrite=overwrite, resume=resume)
         options = MappingOptions(num_threads=num_threads, random_seed=seed, overwrite=overwrite)
@@ -116,7 +116,7 @@ def run_demo(
 
 
 def _photographs(
-    output: Path, num_images: int, seed: int, log: StageLog, *, overwrite: bool, resume: bool
+    output: Path, num_images: int, seed: int, num_threads: int, log: StageLog, *, overwrite: bool, resume: bool
 ) -> TrueCameras:
     """Render the photographs to ``output/images`` atomically, or reuse them on resume; return their cameras."""
     image_path = output / "images"
@@ -136,6 +136,7 @@ def _photographs(
                     rendered,
                     num_images=num_images,
                     seed=seed,
+                    num_threads=num_threads,
                     on_image=lambda done: log.progress(f"{done} of {num_images} photographs", done / num_images),
                 )
                 write_truth(output / "truth.txt", cameras)

@@ -1,6 +1,8 @@
 """Render a folder of photographs, and keep their true cameras."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +74,7 @@ def render_photographs(
     *,
     num_images: int = 24,
     seed: int = 0,
+    num_threads: int = 1,
     on_image: Callable[[int], None] | None = None,
 ) -> TrueCameras:
     """Render a scene to JPEG files with EXIF data.
@@ -83,6 +86,8 @@ def render_photographs(
     num_images : int
     seed : int
         Random seed of the scene, the cameras and the noise.
+    num_threads : int
+        Photographs rendered at once, 150 MB each; they do not depend on it. -1: as many as there are cores.
     on_image : callable, optional
         Called with the number of photographs that are done.
 
@@ -96,13 +101,17 @@ def render_photographs(
     caster = RayCaster(paint(build_ruin(scene_rng), scene_rng))
     cameras = true_cameras(num_images, seed)
     rays = pixel_rays(cameras.camera)
-    for k, name in enumerate(cameras.names):
+
+    def render(k: int) -> bytes:
         pixels = photograph(caster, rays, cameras.rotations[k], cameras.centers[k], image_rngs[k])
         _, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 93])
-        exif = with_focal_length(jpeg.tobytes(), "colmap_vg", "demo", _FOCAL_35MM / 5.6, round(_FOCAL_35MM))
-        (image_path / name).write_bytes(exif)
-        if on_image is not None:
-            on_image(k + 1)
+        return with_focal_length(jpeg.tobytes(), "colmap_vg", "demo", _FOCAL_35MM / 5.6, round(_FOCAL_35MM))
+
+    with ThreadPoolExecutor(num_threads if num_threads > 0 else os.cpu_count()) as pool:
+        for k, file in enumerate(pool.map(render, range(num_images))):
+            (image_path / cameras.names[k]).write_bytes(file)
+            if on_image is not None:
+                on_image(k + 1)
     return cameras
 
 

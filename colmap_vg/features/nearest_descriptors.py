@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours among descriptors, of two whole images or along the epipolar lines of a pair.
+"""Mutual nearest neighbours among descriptors: of whole images, along epipolar lines, or near predicted places.
 
 Descriptors are bytes of norm near 512, so that products of two of them, sums of 128 integers below 2**16, are exact in
 single precision: matches do not depend on the BLAS library, its threads, or the blocks in which they are computed.
@@ -13,12 +13,17 @@ MAX_EPIPOLAR_RATIO = 0.65
 """The same among features near one epipolar line. They are few, so that a false nearest one passes 0.8 more often."""
 MAX_SQUARED_DISTANCE = 2.0 - 2.0 * np.cos(0.7)
 """Of matching descriptors of norm 1: 0.7 radians, as in COLMAP."""
+MAX_WINDOW_RATIO = 0.7
+"""The same among features in a window about the predicted place, a fiftieth of the image."""
 _SQUARED_NORM = np.float32(512.0**2)
 _BLOCK_ROWS = 256
 """Descriptors whose products with those of another image are held at once; 8 MB with 8,192 of them."""
 _NUM_BUNDLES = 24
 """Bundles of epipolar lines whose features are compared at once: fewer compare more features in vain, and more spend
 their time in calls (0.02 s a pair of 8,192 features at 16 to 48)."""
+
+_CELLS = 8
+"""Columns, and rows in each, of the cells of features that are compared with a window at once."""
 
 Bytes = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -105,9 +110,49 @@ def epipolar_matches(
         away = np.abs((of_points - 0.5 * (low + high) + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
         near = np.flatnonzero(away <= 0.5 * (high - low) + reach)
         products = descriptors1[rows].astype(np.float32) @ descriptors2[near].astype(np.float32).T
-        products[np.abs(lines32[rows] @ x32[near].T) > max_error] = 0.0
+        np.copyto(products, 0.0, where=np.abs(lines32[rows] @ x32[near].T) > max_error)
         best.compare(rows, near, products)
     return best.matches(MAX_EPIPOLAR_RATIO)
+
+
+def homography_matches(
+    H: Array, points1: Array, points2: Array, descriptors1: Bytes, descriptors2: Bytes, max_shift: float
+) -> IntArray:
+    """Match mutual nearest neighbours among features near where a homography takes them.
+
+    Parameters
+    ----------
+    H : (3, 3) array
+        Takes points of image 1 to image 2.
+    points1, points2 : (n, 2), (m, 2) array
+        Pixels.
+    descriptors1, descriptors2 : (n, d), (m, d) uint8 array
+    max_shift : float
+        Largest difference of a coordinate from the predicted one, pixels. It leaves room for what is off the plane.
+
+    Returns
+    -------
+    (k, 2) int64 array
+        Rows of both, in the order of the first.
+    """
+    best = _Nearest(len(points1), len(points2))
+    taken = _homogeneous(points1) @ H.T
+    seen = np.flatnonzero(np.abs(taken[:, 2]) > np.finfo(float).tiny)
+    predicted = np.full((len(points1), 2), np.inf)
+    predicted[seen] = taken[seen, :2] / taken[seen, 2:]
+    predicted32, (x2, y2) = predicted.astype(np.float32), points2.astype(np.float32).T.copy()
+    for column in np.array_split(seen[np.argsort(predicted[seen, 0], kind="stable")], _CELLS):
+        for rows in np.array_split(column[np.argsort(predicted[column, 1], kind="stable")], _CELLS):
+            if not len(rows):
+                continue
+            low, high = predicted[rows].min(axis=0) - max_shift, predicted[rows].max(axis=0) + max_shift
+            near = np.flatnonzero((x2 >= low[0]) & (x2 <= high[0]) & (y2 >= low[1]) & (y2 <= high[1]))
+            products = descriptors1[rows].astype(np.float32) @ descriptors2[near].astype(np.float32).T
+            shift = np.abs(predicted32[rows, 0, None] - x2[near])
+            np.maximum(shift, np.abs(predicted32[rows, 1, None] - y2[near]), out=shift)
+            np.copyto(products, 0.0, where=shift > max_shift)
+            best.compare(rows, near, products)
+    return best.matches(MAX_WINDOW_RATIO)
 
 
 def _homogeneous(points: Array) -> Array:

@@ -1,8 +1,8 @@
 """Match two images: their largest features first, and along epipolar lines what is left.
 
 Features of the largest scales are few and the most repeatable. They are matched by brute force, and where they verify
-an epipolar geometry, all features are matched near its lines: of 8,192 features a twentieth of the products. Pairs on
-one plane, whose epipolar lines are undetermined, are matched by brute force in full.
+an epipolar geometry, all features are matched near its lines: of 8,192 features a twentieth of the products. In pairs
+on one plane, whose epipolar lines are undetermined, they are matched near where the homography takes them.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_vg.features.nearest_descriptors import epipolar_matches, mutual_matches
+from colmap_vg.features.nearest_descriptors import epipolar_matches, homography_matches, mutual_matches
 from colmap_vg.features.orientation_votes import excess_over_chance, log2_scales, num_agreeing, orientations
 
 MAX_FIRST_FEATURES = 2048
@@ -25,6 +25,8 @@ MIN_EPIPOLAR_ERROR_PX = 1.0
 """Pixels from the epipolar line within which features are matched at least: a geometry from few matches is so exact."""
 MAX_EPIPOLAR_ERROR_PX = 4.0
 """The same at most: what RANSAC accepts as an inlier."""
+MAX_SHIFT = 0.06
+"""Share of the image's longer side within which features are matched about the place that a homography predicts."""
 _RESIDUALS_IN_BOUND = 4.5
 """Median residuals of the first inliers in the bound on others: three standard deviations of normal errors."""
 
@@ -93,22 +95,25 @@ def match_pair(first: ImageFeatures, second: ImageFeatures, options: pycolmap.Tw
         return PairMatches(matches, geometry)
     if not first.has_more and not second.has_more:
         return PairMatches(matches, geometry)
-    if not _determines_lines(geometry):
+    if _determines_lines(geometry):
+        more = _near_lines(first, second, geometry)
+    elif geometry.H is not None:
+        more = _near_places(first, second, np.asarray(geometry.H))
+    else:
         return match_all_features(first, second, options)
-    near_lines = _near_lines(first, second, geometry)
-    tried = np.isin(near_lines[:, 0], first.largest) & np.isin(near_lines[:, 1], second.largest)
-    matches = _joined(matches, np.asarray(geometry.inlier_matches, dtype=np.int64), near_lines[~tried])
+    tried = np.isin(more[:, 0], first.largest) & np.isin(more[:, 1], second.largest)
+    matches = _joined(matches, np.asarray(geometry.inlier_matches, dtype=np.int64), more[~tried])
     found = _verified(first, second, matches, _confirming(options))
     if len(found.inlier_matches) < len(geometry.inlier_matches):
         return PairMatches(matches, geometry)
     return PairMatches(matches, found)
 
 
-def _joined(matches: IntArray, inliers: IntArray, near_lines: IntArray) -> IntArray:
-    """Matches of the largest features, and those near lines of features that are in no inlier match of these."""
-    new = ~np.isin(near_lines[:, 0], inliers[:, 0]) & ~np.isin(near_lines[:, 1], inliers[:, 1])
-    old = ~np.isin(matches[:, 0], near_lines[new, 0]) & ~np.isin(matches[:, 1], near_lines[new, 1])
-    joined = np.concatenate([matches[old], near_lines[new]])
+def _joined(matches: IntArray, inliers: IntArray, more: IntArray) -> IntArray:
+    """Matches of the largest features, and more matches of features that are in no inlier match of these."""
+    new = ~np.isin(more[:, 0], inliers[:, 0]) & ~np.isin(more[:, 1], inliers[:, 1])
+    old = ~np.isin(matches[:, 0], more[new, 0]) & ~np.isin(matches[:, 1], more[new, 1])
+    joined = np.concatenate([matches[old], more[new]])
     return np.asarray(joined[np.argsort(joined[:, 0], kind="stable")])
 
 
@@ -177,6 +182,12 @@ def _near_lines(first: ImageFeatures, second: ImageFeatures, geometry: pycolmap.
         bound,
     )
     return np.stack([seen[0][matches[:, 0]], seen[1][matches[:, 1]]], axis=1)
+
+
+def _near_places(first: ImageFeatures, second: ImageFeatures, H: Array) -> IntArray:
+    """Matches near where a homography takes the features."""
+    max_shift = MAX_SHIFT * max(second.camera.width, second.camera.height)
+    return homography_matches(H, first.points, second.points, first.descriptors, second.descriptors, max_shift)
 
 
 def _distances(F: Array, points1: Array, points2: Array) -> Array:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 CONTRAST_THRESHOLD = 0.02
 """Least contrast of a feature, as a share of the full range, times OpenCV's number of scales per octave."""
-MAX_PIXELS = 1_750_000
-"""Pixels of an image whose pyramid is built at once: about 400 MB."""
+MAX_PIXELS = 1_600_000
+"""Pixels of an image whose pyramid is built at once: about 380 MB."""
 TILE = 1024
 """Pixels; side of the tiles of larger images."""
 _MARGIN = 64

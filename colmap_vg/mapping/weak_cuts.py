@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.mapping.pair_agreement import PairRotations, agreeing_pairs
@@ -32,6 +33,11 @@ MIN_IMAGES, MAX_NUM_CUTS = 3, 6
 MAX_DISTANCE_RATIO = 1.3
 """Maximum ratio of the distances of two images from a point that both should see: along a street, features are no
 longer detected as their scale in the image grows."""
+MAX_FORESHORTENING = 0.3
+"""Largest relative difference of the cosines under which two images look at the surface around a point that both should
+see. It also leaves out what one of them sees from behind, and what hides behind a corner."""
+NUM_NEIGHBORS, MAX_FLATNESS = 12, 0.05
+"""Points that determine the normal of the surface; maximum ratio of their two smallest variances where it is one."""
 MAX_NUM_POINTS = 1500
 """Maximum number of sampled points."""
 MIN_EXPECTED = 30
@@ -73,9 +79,11 @@ class WeakCut:
 
     @property
     def contradicted(self) -> bool:
-        """Whether too few expected observations exist across the cut for both sides to show one place."""
+        """Whether too few expected observations exist across the cut, by a standard deviation, for one place."""
+        if self.num_expected < MIN_EXPECTED:
+            return False
         usual = MIN_SHARE_OF_USUAL * self.share_seen_elsewhere
-        return self.num_expected >= MIN_EXPECTED and self.share_seen < usual
+        return bool(self.share_seen + np.sqrt(usual * (1.0 - usual) / self.num_expected) < usual)
 
 
 def weak_cuts(
@@ -202,7 +210,20 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     centers = np.array([reconstruction.image(i).projection_center() for i in ids])
     to_image, to_near = centers[image] - tracks.points[point], centers[near] - tracks.points[point]
     farther = np.log(np.linalg.norm(to_image, axis=1) / np.linalg.norm(to_near, axis=1))
-    cosine = np.einsum("ka,ka->k", normalized(to_image), normalized(to_near))
+    to_image, to_near = normalized(to_image), normalized(to_near)
+    cosine = np.einsum("ka,ka->k", to_image, to_near)
+    normals, flat = _normals(reconstruction, tracks.points)
+    facing = np.einsum("ka,ka->k", normals[point], to_image) / np.einsum("ka,ka->k", normals[point], to_near)
+    alike = ~flat[point] | (np.abs(facing - 1.0) <= MAX_FORESHORTENING)
     expected = (cosine >= np.cos(np.radians(NEAR_DEG))) & (np.abs(farther) <= np.log(MAX_DISTANCE_RATIO))
-    expected &= were_compared[image, near]
+    expected &= were_compared[image, near] & alike
     return _Expected(point[expected], image[expected], near[expected], tracks.sees[point, image][expected])
+
+
+def _normals(reconstruction: "pycolmap.Reconstruction", points: Array) -> tuple[Array, BoolArray]:
+    """Normals (k, 3), of either sign, of the surface through points (k, 3) and their neighbours, and if it is flat."""
+    every = np.array([point.xyz for point in reconstruction.points3D.values()])
+    neighbors = every[cKDTree(every).query(points, min(NUM_NEIGHBORS, len(every)))[1]].reshape(len(points), -1, 3)
+    deviations = neighbors - neighbors.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("kna,knb->kab", deviations, deviations))
+    return vectors[:, :, 0], np.asarray(values[:, 0] <= MAX_FLATNESS * values[:, 1])

@@ -84,6 +84,14 @@ def test_photographs_are_the_seeds_and_tell_colmap_their_focal_length(tmp_path: 
     assert guess.mean_focal_length() == pytest.approx(cameras.camera.mean_focal_length(), rel=0.01)
 
 
+def test_threads_do_not_change_photographs(tmp_path: Path) -> None:
+    for threads in (1, 3):
+        (tmp_path / str(threads)).mkdir()
+        render_photographs(tmp_path / str(threads), num_images=4, num_threads=threads)
+    for one in sorted((tmp_path / "1").iterdir()):
+        assert one.read_bytes() == (tmp_path / "3" / one.name).read_bytes()
+
+
 def test_truth_is_written_as_poses(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     cameras = render_photographs(tmp_path / "images", num_images=2, seed=0)
@@ -111,5 +119,6 @@ def test_demo_ends_within_three_thousandths_of_the_radius(tmp_path: Path) -> Non
     assert result.exit_code == 0, result.output
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["comparison"]["num_registered"] == 8
+    assert not any("look" in warning and "alike" in warning for warning in summary["warnings"])
     assert summary["comparison"]["mean_position_error_share"] <= 0.003
     assert pycolmap.Reconstruction(tmp_path / "out" / "0").num_reg_images() == 8

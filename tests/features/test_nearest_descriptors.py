@@ -7,7 +7,9 @@ from colmap_vg.features.nearest_descriptors import (
     MAX_EPIPOLAR_RATIO,
     MAX_RATIO,
     MAX_SQUARED_DISTANCE,
+    MAX_WINDOW_RATIO,
     epipolar_matches,
+    homography_matches,
     mutual_matches,
 )
 
@@ -83,10 +85,29 @@ def test_epipolar_matches_are_those_of_brute_force_near_lines(inside: bool) -> N
     assert {tuple(row) for row in scaled.tolist()} == found
 
 
+def test_homography_matches_are_those_of_brute_force_near_predicted_places() -> None:
+    rng = np.random.default_rng(8)
+    first, second = similar_sets(9)
+    H = np.array([[0.9, 0.1, 30.0], [-0.05, 1.1, -20.0], [1e-4, -5e-5, 1.0]])
+    points1 = rng.uniform([0.0, 0.0], [1000.0, 800.0], (len(first), 2))
+    taken = np.concatenate([points1, np.ones((len(points1), 1))], axis=1) @ H.T
+    predicted = taken[:, :2] / taken[:, 2:]
+    points2 = rng.uniform([0.0, 0.0], [1000.0, 800.0], (len(second), 2))
+    nearest = (first.astype(int) @ second.astype(int).T).argmax(axis=0)
+    moved = rng.random(len(second)) < 0.6
+    points2[moved] = predicted[nearest[moved]] + rng.uniform(-60.0, 60.0, (moved.sum(), 2))
+    allowed = (np.abs(predicted[:, None] - points2[None]) <= 50.0).all(axis=2)
+    expected = by_brute_force(first, second, allowed, MAX_WINDOW_RATIO, both_ways=False)
+    found = {tuple(row) for row in homography_matches(-2.0 * H, points1, points2, first, second, 50.0).tolist()}
+    assert found == expected
+    assert len(found) > 100
+
+
 def test_nothing_matches_nothing() -> None:
     none, some = np.empty((0, 128), np.uint8), descriptors(np.random.default_rng(0), 5)
     for first, second in ((none, none), (none, some), (some, none)):
         assert mutual_matches(first, second).shape == (0, 2)
         points1, points2 = np.ones((len(first), 2)), np.ones((len(second), 2))
         assert epipolar_matches(np.eye(3), points1, points2, first, second, 2.0).shape == (0, 2)
+        assert homography_matches(np.eye(3), points1, points2, first, second, 2.0).shape == (0, 2)
     assert len(mutual_matches(some, some[:1])) == 1

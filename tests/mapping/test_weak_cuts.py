@@ -4,6 +4,7 @@ from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from linked_scenes import alike_streets, near, projection_centers, street, survey, write_scene
 
@@ -11,6 +12,7 @@ from colmap_vg import MappingOptions, SolutionStatus
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.bridges import all_bridges
 from colmap_vg.jobs.mapper import MappingResult, map_database
+from colmap_vg.mapping.weak_cuts import WeakCut, _normals
 
 NUM = 10
 
@@ -75,3 +77,28 @@ def test_pairs_that_nobody_compared_are_not_missed(tmp_path: Path) -> None:
     result, warnings = mapped(tmp_path / "a.db", tmp_path / "out")
     assert result.solution.status == SolutionStatus.SOLVED
     assert not warnings
+
+
+def test_few_expected_observations_contradict_only_by_a_standard_deviation() -> None:
+    def cut(expected: int, seen: int) -> WeakCut:
+        return WeakCut(frozenset({1, 2, 3}), 5, 500, expected, seen, 0.64)
+
+    assert not cut(29, 0).contradicted  # too few to tell
+    assert not cut(45, 18).contradicted  # 0.40, where 0.416 +- 0.07 is the bound
+    assert cut(45, 14).contradicted
+    assert cut(4500, 1750).contradicted
+
+
+def test_normals_are_those_of_walls_and_none_of_clouds() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.stack([rng.uniform(0, 4, 600), rng.normal(0, 0.01, 600), rng.uniform(0, 3, 600)], axis=1)
+    side = wall[:, [1, 0, 2]] + [8.0, 1.0, 0.0]
+    cloud = rng.uniform([0.0, 20.0, 0.0], [3.0, 23.0, 3.0], (600, 3))
+    reconstruction = pycolmap.Reconstruction()
+    for xyz in np.concatenate([wall, side, cloud]):
+        reconstruction.add_point3D(xyz, pycolmap.Track())
+    for points, axis in ((wall[:50], 1), (side[:50], 0)):
+        normals, flat = _normals(reconstruction, points)
+        assert flat.mean() > 0.95
+        assert np.abs(normals[flat, axis]).min() > 0.98
+    assert _normals(reconstruction, cloud[:200])[1].mean() < 0.1

@@ -38,7 +38,7 @@ def test_both_ways_make_a_model_of_a_folder(tmp_path: Path) -> None:
         assert all(wall > 0 and cpu > 0 for _, wall, cpu in one.stages)
         assert one.mean_error is not None
         assert one.mean_error < 0.2
-    assert abs(ours.num_inlier_matches / theirs.num_inlier_matches - 1) < 0.1
+    assert 0.6 < ours.num_inlier_matches / theirs.num_inlier_matches < 1.4  # other features, but as many
 
 
 def test_what_cannot_run_is_named(tmp_path: Path) -> None:
