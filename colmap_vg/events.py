@@ -24,6 +24,8 @@ class StageEvent:
         Share of the stage that is done, 0 to 1; None if unknown.
     seconds : float
         Time since the stage started.
+    count : int or None
+        Number of photographs or pairs that are done; None where nothing is counted.
     """
 
     stage: str
@@ -31,6 +33,7 @@ class StageEvent:
     message: str = ""
     fraction: float | None = None
     seconds: float = 0.0
+    count: int | None = None
 
 
 @dataclass(frozen=True)
@@ -81,9 +84,9 @@ class StageLog:
         self.records.append(StageRecord(name, seconds, peak_memory_mib(), self._message))
         self._emit("finished", self._message)
 
-    def progress(self, message: str = "", fraction: float | None = None) -> None:
+    def progress(self, message: str = "", fraction: float | None = None, count: int | None = None) -> None:
         """Emit an event on the progress of the current stage."""
-        self._emit("progress", message, fraction)
+        self._emit("progress", message, fraction, count)
 
     def result(self, message: str) -> None:
         """Set the line on the result of the current stage for its record."""
@@ -99,10 +102,11 @@ class StageLog:
         state: StageState,
         message: str = "",
         fraction: float | None = None,
+        count: int | None = None,
     ) -> None:
         if self.on_event is not None:
             seconds = time.perf_counter() - self._start if self._stage else 0.0
-            self.on_event(StageEvent(self._stage, state, message, fraction, seconds))
+            self.on_event(StageEvent(self._stage, state, message, fraction, seconds, count))
 
 
 def peak_memory_mib() -> float:

@@ -11,6 +11,8 @@ from colmap_vg.events import StageEvent, StageRecord, peak_memory_mib
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+MIN_PACE_SECONDS = 1.0
+"""Seconds of a stage from which a rate and the time left are told."""
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain progress lines of one stage, so that log files stay short."""
 
@@ -34,6 +36,7 @@ class Reporter:
     _progress: "Progress | None" = None
     _task: "TaskID | None" = None
     _last_line: float = 0.0
+    _first: StageEvent | None = None
 
     def __enter__(self) -> Self:
         if not self.quiet and sys.stdout.isatty():
@@ -66,7 +69,7 @@ class Reporter:
             self._clear_task()
             self.say(f"{event.stage}: {event.message or 'done'} ({event.seconds:.1f} s)")
         elif event.state == "started":
-            self._last_line = time.perf_counter()
+            self._last_line, self._first = time.perf_counter(), None
             self._start_task(event.stage)
             if self.verbose:
                 self.say(f"{event.stage}: started")
@@ -99,11 +102,34 @@ class Reporter:
 
     def _advance(self, event: StageEvent) -> None:
         line = f"{event.stage}: {event.message}" if event.message else event.stage
+        pace = self._pace(event)
         if self._progress is not None and self._task is not None:
             total = None if event.fraction is None else 1.0
-            self._progress.update(self._task, description=line, total=total, completed=event.fraction or 0.0)
+            description = ", ".join([line, *pace])
+            self._progress.update(self._task, description=description, total=total, completed=event.fraction or 0.0)
         due = time.perf_counter() - self._last_line > PLAIN_INTERVAL
         if self.verbose or (self._progress is None and due):
             self._last_line = time.perf_counter()
-            share = "" if event.fraction is None else f" ({100 * event.fraction:.0f} %)"
-            self.say(f"{line}{share}")
+            share = [] if event.fraction is None else [f"{100 * event.fraction:.0f} %"]
+            self.say(f"{line} ({', '.join([*share, *pace])})" if share or pace else line)
+
+    def _pace(self, event: StageEvent) -> list[str]:
+        """Rate in photographs or pairs a second, and the time left, from the stage's first event with a share on."""
+        if event.fraction is None:
+            return []
+        if self._first is None or self._first.fraction is None or event.fraction < self._first.fraction:
+            self._first = event
+        first, pace = self._first, []
+        seconds, done = event.seconds - first.seconds, event.fraction - (first.fraction or 0.0)
+        if seconds < MIN_PACE_SECONDS or done <= 0.0:
+            return []
+        if event.count is not None and first.count is not None and event.count > first.count:
+            pace.append(f"{(event.count - first.count) / seconds:.1f}/s")
+        return [*pace, f"{_duration(seconds * (1.0 - event.fraction) / done)} left"]
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -137,7 +137,7 @@ def _photographs(
                     num_images=num_images,
                     seed=seed,
                     num_threads=num_threads,
-                    on_image=lambda done: log.progress(f"{done} of {num_images} photographs", done / num_images),
+                    on_image=lambda done: log.progress(f"{done} of {num_images} photographs", done / num_images, done),
                 )
                 write_truth(output / "truth.txt", cameras)
                 if image_path.exists():

@@ -292,7 +292,7 @@ def _extract_by_colmap(
     threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
     step = IMAGES_PER_CALL * threads
     for start in range(0, len(names), step):
-        log.progress(f"{start} of {len(names)} photographs", start / len(names))
+        log.progress(f"{start} of {len(names)} photographs", start / len(names), start)
         part = names[start : start + step]
         pycolmap.extract_features(
             database_path, image_path, part, camera_mode, reader_options, extraction, pycolmap.Device.cpu

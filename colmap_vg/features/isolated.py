@@ -124,7 +124,7 @@ def _talk(process: "subprocess.Popen[bytes]", request: bytes, log: StageLog) -> 
     for line in stdout:
         message = json.loads(line)
         if message.get("state") == "progress":
-            log.progress(message["message"], message["fraction"])
+            log.progress(message["message"], message["fraction"], message["count"])
         elif message.get("state") == "warning":
             log.warn(message["message"])
         else:
@@ -196,7 +196,9 @@ def _end_with(pipe: IO[bytes]) -> None:
 
 def _pass_on(event: StageEvent, answers: IO[str]) -> None:
     if event.state in ("progress", "warning"):
-        _tell(answers, {"state": event.state, "message": event.message, "fraction": event.fraction})
+        _tell(
+            answers, {"state": event.state, "message": event.message, "fraction": event.fraction, "count": event.count}
+        )
 
 
 def _tell(answers: IO[str], content: dict[str, Any]) -> None:

@@ -123,11 +123,11 @@ def match_pairs(
         todo = [pair for pair in by_id if not matcher.is_matched(*pair)]
         for done in matcher.match(match_pair, todo):
             share = SELECTION_SHARE + (_FIRST_SHARE - SELECTION_SHARE) * done / len(todo)
-            log.progress(f"{done} of {len(todo)} pairs", share)
+            log.progress(f"{done} of {len(todo)} pairs", share, done)
         weak = matcher.weak_pairs(by_id)
         for done in matcher.match(match_all_features, weak):
             share = _FIRST_SHARE + (1.0 - _FIRST_SHARE) * done / len(weak)
-            log.progress(f"{done} of {len(weak)} pairs with few matches", share)
+            log.progress(f"{done} of {len(weak)} pairs with few matches", share, done)
 
 
 class _Matcher:

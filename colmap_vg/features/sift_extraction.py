@@ -61,7 +61,7 @@ def extract_sift(
             if len(waiting) >= _WAITING_PER_THREAD * workers:
                 _write(database, *waiting.pop(0))
                 done = len(names) - len(todo) + count + 1 - len(waiting)
-                log.progress(f"{done} of {len(names)} photographs", done / len(names))
+                log.progress(f"{done} of {len(names)} photographs", done / len(names), done)
         for image_id, features in waiting:
             _write(database, image_id, features)
 

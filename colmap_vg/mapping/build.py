@@ -92,7 +92,7 @@ def build_model(
         image_ids = sorted(reconstruction.reg_image_ids())
         for count, image_id in enumerate(image_ids, start=1):
             mapper.triangulate_image(triangulator, image_id)
-            log.progress(f"{count} of {len(image_ids)} images", count / len(image_ids))
+            log.progress(f"{count} of {len(image_ids)} images", count / len(image_ids), count)
         mapper.complete_and_merge_tracks(triangulator)
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):

@@ -7,7 +7,7 @@ import pytest
 
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.errors import OutputError
-from colmap_vg.events import StageLog
+from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.jobs.summary import edge_summary, image_summary, job_summary, write_summary
 from colmap_vg.options import MappingOptions
 
@@ -42,6 +42,26 @@ def test_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
 def test_verbose_shows_every_event(capsys: pytest.CaptureFixture[str]) -> None:
     _, lines = shown(capsys, verbose=True)
     assert lines[:2] == ["features: started", "features: 1 of 2 (50 %)"]
+
+
+def test_progress_has_a_rate_and_the_time_left(capsys: pytest.CaptureFixture[str]) -> None:
+    with Reporter(verbose=True) as reporter:
+        for seconds, count in ((0.5, 0), (0.9, 2), (10.5, 20), (60.5, 120), (70.5, None)):
+            share = None if count is None else count / 8000
+            reporter.on_event(StageEvent("matching", "progress", "of 8000 pairs", share, seconds, count))
+        reporter.on_event(StageEvent("write", "started"))
+        reporter.on_event(StageEvent("write", "progress", "models", 0.5, 5.0))
+        reporter.on_event(StageEvent("write", "progress", "models", 0.75, 30.0))
+    assert capsys.readouterr().out.splitlines() == [
+        "matching: of 8000 pairs (0 %)",
+        "matching: of 8000 pairs (0 %)",
+        "matching: of 8000 pairs (0 %, 2.0/s, 1 h 6 min left)",
+        "matching: of 8000 pairs (2 %, 2.0/s, 1 h 5 min left)",
+        "matching: of 8000 pairs",
+        "write: started",
+        "write: models (50 %)",
+        "write: models (75 %, 25 s left)",
+    ]
 
 
 def test_quiet_shows_nothing_and_keeps_everything(capsys: pytest.CaptureFixture[str]) -> None:
