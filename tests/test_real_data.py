@@ -19,7 +19,8 @@ from colmap_vg import (
 )
 from colmap_vg.geometry import so3
 from colmap_vg.mapping.support import supported_observations
-from colmap_vg.two_view.essential import essential_from_pose, sampson_errors
+from colmap_vg.two_view.essential import essential_from_pose
+from colmap_vg.two_view.sampson_errors import sampson_errors
 from colmap_vg.two_view.segments import segment_quantiles
 
 pytestmark = pytest.mark.real_data

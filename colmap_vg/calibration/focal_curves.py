@@ -22,7 +22,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 LOWEST, HIGHEST = float(np.log(0.3)), float(np.log(5.0))  # log focal over image size: 118° to 11° of view
-CAUCHY_SCALE = 3.0  # standard deviations
+CAUCHY_SCALE = 3.0  # standard deviations; also of the costs of rotation cycles
 _NODES = np.linspace(LOWEST, HIGHEST, 10)  # log focals; the standard deviations, smooth in log f, are interpolated
 _DEFAULT_SIGMA = 2e-3  # of vec(F) per match without covariances, dimensionless: image sizes and ||F|| are 1
 _DEFAULT_MATCHES = 100

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.calibration.focal_curves import CAUCHY_SCALE
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.rotations.robust import average_rotations_robust
@@ -30,7 +31,6 @@ _FINE_STEPS = (0.06, 0.02)  # log factor; steps of the two finer grids, about a 
 _NUM_FINE = 3  # values of a finer grid on each side of the minimum
 _MATCHES_PER_PAIR = 100
 _NUM_STEPS = 6  # Levenberg-Marquardt steps; the nearest essential matrix is within a few standard deviations
-_CAUCHY_SCALE = 3.0  # standard deviations
 _MODEL_SIGMA = 1e-3  # radians; error of the lens model and correlation of keypoints, beside the noise of the matches
 _AVERAGING_SIGMA_DEG = 2.0  # degrees; scale of the robust rotation averaging
 _SIDE = np.log(1.25)  # log factor at which the rise of the cost is measured
@@ -260,7 +260,7 @@ def _cycle_cost(pairs: CyclePairs, focal_x: Array, focal_y: Array, principal_poi
     solved = averaged[pairs.images[:, 1]] @ np.swapaxes(averaged[pairs.images[:, 0]], 1, 2)
     residual = so3.log(solved @ np.swapaxes(refined.rotations, 1, 2))
     squared = np.einsum("ma,ma->m", residual, residual) * weights
-    return float((_CAUCHY_SCALE**2 * np.log1p(squared / _CAUCHY_SCALE**2)).sum())
+    return float((CAUCHY_SCALE**2 * np.log1p(squared / CAUCHY_SCALE**2)).sum())
 
 
 def _parabola(x: Array, y: Array) -> tuple[float, float]:

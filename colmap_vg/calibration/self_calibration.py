@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.calibration.focal import FocalAgreement, focal_agreement
 from colmap_vg.calibration.focal_cycles import (
+    CyclePairs,
     CycleVote,
     focal_fits_cycles,
     select_cycle_pairs,
@@ -142,20 +143,35 @@ def estimate_focal_lengths(
     pairs = select_cycle_pairs(F, edges[used], camera_idx, of_used, p1, p2) if undecided.any() else None
     if pairs is not None:
         aspect = np.ones(len(focal)) if aspect_ratios is None else aspect_ratios
-        guessed = undecided & ~given
-        if guessed.any():
-            longer = image_sizes if image_sizes.ndim == 1 else image_sizes.max(axis=1)
-            by_cycles = vote_focal_by_rotation_cycles(
-                pairs, np.where(guessed, longer, focal), aspect, principal_points, guessed
-            )
-            replaced = guessed & by_cycles.reliable
-        elif focal_fits_cycles(pairs, focal, aspect, principal_points, undecided):
-            replaced = np.zeros(len(focal), dtype=bool)
-        else:
-            by_cycles = vote_focal_by_rotation_cycles(pairs, focal, aspect, principal_points, undecided)
-            replaced = undecided & (by_cycles.reliable and abs(np.log(by_cycles.factor)) > np.log1p(CYCLE_TOLERANCE))
+        longer = image_sizes if image_sizes.ndim == 1 else image_sizes.max(axis=1)
+        by_cycles, replaced = _vote_by_cycles(pairs, focal, aspect, principal_points, longer, undecided, given)
         if by_cycles is not None:
             decided |= undecided & by_cycles.reliable
             focal = np.where(replaced, by_cycles.focal_lengths, focal)
         found |= replaced
     return SelfCalibration(focal, found, decided, votes, by_cycles)
+
+
+def _vote_by_cycles(
+    pairs: CyclePairs,
+    focal_lengths: Array,
+    aspect_ratios: Array,
+    principal_points: Array,
+    guesses: Array,
+    undecided: BoolArray,
+    given: BoolArray,
+) -> tuple[CycleVote | None, BoolArray]:
+    """Estimate the focal lengths of undecided cameras by rotation cycles; None if given ones are consistent with them.
+
+    Also returns the mask (c,) of the cameras whose focal length the estimate replaces. Without given focal lengths the
+    estimate starts at `guesses` (c,), pixels.
+    """
+    guessed = undecided & ~given
+    if guessed.any():
+        start = np.where(guessed, guesses, focal_lengths)
+        vote = vote_focal_by_rotation_cycles(pairs, start, aspect_ratios, principal_points, guessed)
+        return vote, guessed & vote.reliable
+    if focal_fits_cycles(pairs, focal_lengths, aspect_ratios, principal_points, undecided):
+        return None, np.zeros(len(focal_lengths), dtype=bool)
+    vote = vote_focal_by_rotation_cycles(pairs, focal_lengths, aspect_ratios, principal_points, undecided)
+    return vote, undecided & (vote.reliable and abs(np.log(vote.factor)) > np.log1p(CYCLE_TOLERANCE))

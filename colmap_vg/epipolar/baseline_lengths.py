@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletPoses, inverse_depths
 from colmap_vg.epipolar.problem import EpipolarProblem
-from colmap_vg.linear.reweighted import ReweightedLaplacian
+from colmap_vg.linear.laplacian import LaplacianSystem, ReweightedLaplacian
 from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, MAD_TO_SIGMA, cauchy_weight, geman_mcclure_weight
-from colmap_vg.positions.fixed_point import LaplacianSystem, edge_lengths
+from colmap_vg.positions.fixed_point import edge_lengths
 from colmap_vg.positions.result import centered, spread
 from colmap_vg.scene.components import components_by_size
 from colmap_vg.two_view.segments import segment_quantiles, segment_subset

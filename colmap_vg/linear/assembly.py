@@ -1,4 +1,4 @@
-"""Vectorised assembly of graph matrices: scalar Laplacians, incidence matrices, block Gauss-Newton systems.
+"""Vectorised assembly of graph matrices: sums at nodes, and symmetric systems with a block per node and edge.
 
 The sparsity pattern depends only on the edges: it is computed once, and values are summed into it afterwards.
 """
@@ -9,13 +9,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-
-def incidence(num_nodes: int, edges: IntArray) -> sp.csr_array:
-    """Incidence matrix (m, n): row k has -1 at edges[k, 0] and +1 at edges[k, 1], so that ``B @ p = p_j - p_i``."""
-    m = len(edges)
-    data = np.tile([-1.0, 1.0], m)
-    return sp.csr_array((data, edges.ravel(), np.arange(0, 2 * m + 1, 2)), shape=(m, num_nodes))
 
 
 def sum_at_nodes(num_nodes: int, nodes: IntArray, values: Array) -> Array:
@@ -30,12 +23,6 @@ def sum_at_nodes(num_nodes: int, nodes: IntArray, values: Array) -> Array:
         columns = np.arange(len(nodes) + 1)
         out = sp.csc_array((np.ones(len(nodes)), nodes, columns), shape=(num_nodes, len(nodes))) @ flat
     return np.asarray(out, dtype=np.float64).reshape(num_nodes, *values.shape[1:])
-
-
-def laplacian(num_nodes: int, edges: IntArray, weights: Array) -> sp.csc_array:
-    """Weighted graph Laplacian ``B^T diag(w) B``, (n, n)."""
-    B = incidence(num_nodes, edges)
-    return sp.csc_array(B.T @ sp.csr_array(B.multiply(weights[:, None])))
 
 
 class BlockPattern:

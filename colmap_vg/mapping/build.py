@@ -96,38 +96,11 @@ def build_model(
         mapper.complete_and_merge_tracks(triangulator)
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):
-        lenses = _focal_lengths(reconstruction)
-        cost_ratio, enough = (
-            _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4),
-            GOOD_START_COST_RATIO,
-        )
-        for _ in range(MAX_NUM_ROUNDS):
-            before, lenses = lenses, _focal_lengths(reconstruction)
-            mapper.complete_and_merge_tracks(triangulator)
-            mapper.retriangulate(triangulator)
-            _filter(mapper)
-            if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
-                break
-            cost_ratio, enough = (
-                _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5),
-                CONVERGED_COST_RATIO,
-            )
-        else:
+        if not _adjust_to_convergence(mapper, options):
             log.warn(f"Bundle adjustment did not converge in {MAX_NUM_ROUNDS} rounds; the model may be bent.")
         log.result(_state(reconstruction))
     with log.stage("register"):
-        removed = _remove_unsupported(mapper)
-        # A removed image may be registered again by its points: its pose from the view graph was wrong.
-        added = _register_left_out(mapper, options, others)
-        removed -= added
-        misplaced = _remove_misplaced(mapper, added, pairs)
-        added -= misplaced
-        if added or removed or misplaced:
-            mapper.complete_and_merge_tracks(triangulator)
-            _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-4)
-            again = _remove_unsupported(mapper)
-            removed, added = removed | again, added - again
-        log.result(f"{len(added)} images added, {len(removed)} removed")
+        misplaced = _register_remaining(mapper, options, others, pairs, log)
         reset_diverged_lenses(
             reconstruction,
             cache,
@@ -139,6 +112,46 @@ def build_model(
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return BuildResult(frozenset(misplaced), folded)
+
+
+def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: MappingOptions) -> bool:
+    """Alternate bundle adjustment and retriangulation; return whether they converged in `MAX_NUM_ROUNDS` rounds."""
+    triangulator = triangulator_options(options)
+    lenses = _focal_lengths(mapper.reconstruction)
+    cost_ratio, enough = _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4), GOOD_START_COST_RATIO
+    for _ in range(MAX_NUM_ROUNDS):
+        before, lenses = lenses, _focal_lengths(mapper.reconstruction)
+        mapper.complete_and_merge_tracks(triangulator)
+        mapper.retriangulate(triangulator)
+        _filter(mapper)
+        if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
+            return True
+        cost_ratio = _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
+        enough = CONVERGED_COST_RATIO
+    return False
+
+
+def _register_remaining(
+    mapper: "pycolmap.IncrementalMapper",
+    options: MappingOptions,
+    others: frozenset[int],
+    pairs: PairRotations | None,
+    log: StageLog,
+) -> set[int]:
+    """Deregister images without support and register images by their points; return the ids of the misplaced ones."""
+    removed = _remove_unsupported(mapper)
+    # A removed image may be registered again by its points: its pose from the view graph was wrong.
+    added = _register_left_out(mapper, options, others)
+    removed -= added
+    misplaced = _remove_misplaced(mapper, added, pairs)
+    added -= misplaced
+    if added or removed or misplaced:
+        mapper.complete_and_merge_tracks(triangulator_options(options))
+        _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-4)
+        again = _remove_unsupported(mapper)
+        removed, added = removed | again, added - again
+    log.result(f"{len(added)} images added, {len(removed)} removed")
+    return misplaced
 
 
 def _focal_lengths(reconstruction: "pycolmap.Reconstruction") -> NDArray[np.float64]:

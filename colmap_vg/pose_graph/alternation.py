@@ -129,65 +129,115 @@ def solve_joint(
     GraphError
         The graph is not connected.
     """
-    solver = PoseGraphSolver(num_images, edges)
     w = unit_weights(weights, len(edges))
-    kappa = w * unit_weights(rotation_weights, len(edges))
     known = None if information is None else _spatial_information(information, cam2_in_cam1_directions)
-    start_Q, start_p = np.swapaxes(initial_rotations, 1, 2), centered(initial_centers)
-    size = spread(start_p)
-    unit = size / np.sqrt(num_images)
-    shortest, shortest_weighted = MIN_RELATIVE_LENGTH * unit, shortest_weighted_length(start_p, edges)
-    reach = farthest_allowed(start_p)
-    log: list[LogEntry] = []
-    # The plain form solves every inner problem accurately, as in the paper; the accelerated one as the change requires.
-    inner_tolerance, last_cost, shrinkage = 1e-3 if accelerate else 1e-6, np.inf, 1.0
-
-    def pack(Q: Array, p: Array) -> Array:
-        return np.concatenate([so3.log(Q @ np.swapaxes(start_Q, 1, 2)), p / unit], axis=1)
-
-    def unpack(x: Array) -> tuple[Array, Array]:
-        return so3.exp(x[:, :3]) @ start_Q, x[:, 3:] * unit
-
-    def iterate(x: Array) -> Array:
-        nonlocal last_cost, shrinkage
-        Q, p = unpack(x)
-        length = np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
-        tau = w if approach == "C" else w / np.maximum(length, shortest_weighted) ** 2
-        translations = length[:, None] * cam2_in_cam1_directions
-        cost: PoseGraphCost
-        if known is None:
-            cost = ChordalCost(edges, cam2_from_cam1_rotations, translations, kappa, tau)
-        else:
-            root = np.sqrt(np.repeat(np.stack([kappa, tau], axis=1), 3, axis=1))
-            weighted = root[:, :, None] * known * root[:, None, :]
-            cost = InformationCost(edges, cam2_from_cam1_rotations, translations, weighted)
-            if robust:
-                cost = replace(cost, information=weighted * _cauchy_weights(cost, Q, p)[:, None, None])
-        # Near the fixed point the inner minimum is p, scaled as in the last iteration: start there to save steps.
-        Q, p, inner = solver.solve(cost, Q, p * shrinkage, tolerance=inner_tolerance)
-        last_cost = inner.cost
-        # The global rotation is free: fix the first camera, so that the fixed point is unique.
-        turn = start_Q[0] @ Q[0].T
-        Q, p = turn @ Q, centered(p @ turn.T)
-        shrinkage = spread(p) / size
-        return pack(Q, regauged(p, size, reach))
-
-    def note(iteration: int, _: Array, change: float) -> None:
-        nonlocal inner_tolerance
-        inner_tolerance = min(inner_tolerance, max((1e-2 if accelerate else 1e-3) * change, 1e-13))
-        name = "2W" if robust else "2" + approach
-        log.append(LogEntry(name, iteration, last_cost, change))
-
+    problem = _JointProblem(
+        edges,
+        cam2_from_cam1_rotations,
+        cam2_in_cam1_directions,
+        approach,
+        w,
+        w * unit_weights(rotation_weights, len(edges)),
+        known,
+        robust,
+    )
+    start = np.swapaxes(initial_rotations, 1, 2), centered(initial_centers)
+    iteration = _OuterIteration(problem, PoseGraphSolver(num_images, edges), *start, accelerate=accelerate)
     x, count, converged = fixed_point(
-        iterate,
-        pack(start_Q, start_p),
+        iteration.step,
+        iteration.pack(*start),
         accelerate=accelerate,
         max_num_iterations=max_num_iterations,
         tolerance=tolerance,
-        on_iteration=note,
+        on_iteration=iteration.note,
     )
-    Q, p = unpack(x)
-    return JointResult(np.swapaxes(Q, 1, 2), p, last_cost, count, converged, tuple(log))
+    Q, p = iteration.unpack(x)
+    return JointResult(np.swapaxes(Q, 1, 2), p, iteration.cost, count, converged, tuple(iteration.log))
+
+
+@dataclass(frozen=True, eq=False)
+class _JointProblem:
+    """Relative poses with their weights; `information` (m, 6, 6) is that of rotation vectors and displacements."""
+
+    edges: IntArray
+    rotations: Array
+    directions: Array
+    approach: Literal["C", "O"]
+    position_weights: Array
+    rotation_weights: Array
+    information: Array | None
+    robust: bool
+
+    def cost_at(self, Q: Array, p: Array, shortest: float, shortest_weighted: float) -> PoseGraphCost:
+        """Cost of PS with scale factors and weights from the previous rotations and positions."""
+        edges, w, kappa = self.edges, self.position_weights, self.rotation_weights
+        length = np.maximum(np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1), shortest)
+        tau = w if self.approach == "C" else w / np.maximum(length, shortest_weighted) ** 2
+        translations = length[:, None] * self.directions
+        if self.information is None:
+            return ChordalCost(edges, self.rotations, translations, kappa, tau)
+        root = np.sqrt(np.repeat(np.stack([kappa, tau], axis=1), 3, axis=1))
+        weighted = root[:, :, None] * self.information * root[:, None, :]
+        cost = InformationCost(edges, self.rotations, translations, weighted)
+        if self.robust:
+            cost = replace(cost, information=weighted * _cauchy_weights(cost, Q, p)[:, None, None])
+        return cost
+
+
+class _OuterIteration:
+    """The outer iteration as a map of rotation vectors and positions (n, 6), and what it keeps from step to step.
+
+    Rotation vectors are relative to the initial rotations, and positions in units of their initial root mean square.
+
+    Attributes
+    ----------
+    cost : float
+        Objective of PS in the last step.
+    log : list of LogEntry
+    """
+
+    def __init__(
+        self, problem: _JointProblem, solver: PoseGraphSolver, start_Q: Array, start_p: Array, *, accelerate: bool
+    ) -> None:
+        self._problem, self._solver, self._start_Q = problem, solver, start_Q
+        self._size = spread(start_p)
+        self._unit = self._size / np.sqrt(len(start_p))
+        self._shortest = MIN_RELATIVE_LENGTH * self._unit
+        self._shortest_weighted = shortest_weighted_length(start_p, problem.edges)
+        self._reach = farthest_allowed(start_p)
+        # The plain form solves every inner problem accurately, as in the paper; the accelerated one as the change
+        # requires.
+        self._inner_tolerance, self._tolerance_per_change = (1e-3, 1e-2) if accelerate else (1e-6, 1e-3)
+        self._shrinkage = 1.0
+        self.cost = np.inf
+        self.log: list[LogEntry] = []
+
+    def pack(self, Q: Array, p: Array) -> Array:
+        """Rotation vectors and positions (n, 6) of world_from_cam rotations Q and positions p."""
+        return np.concatenate([so3.log(Q @ np.swapaxes(self._start_Q, 1, 2)), p / self._unit], axis=1)
+
+    def unpack(self, x: Array) -> tuple[Array, Array]:
+        """Rotations (n, 3, 3) and positions (n, 3), the inverse of :meth:`pack`."""
+        return so3.exp(x[:, :3]) @ self._start_Q, x[:, 3:] * self._unit
+
+    def step(self, x: Array) -> Array:
+        """Solve PS with scale factors from x, and restore the gauge."""
+        Q, p = self.unpack(x)
+        cost = self._problem.cost_at(Q, p, self._shortest, self._shortest_weighted)
+        # Near the fixed point the inner minimum is p, scaled as in the last iteration: start there to save steps.
+        Q, p, inner = self._solver.solve(cost, Q, p * self._shrinkage, tolerance=self._inner_tolerance)
+        self.cost = inner.cost
+        # The global rotation is free: fix the first camera, so that the fixed point is unique.
+        turn = self._start_Q[0] @ Q[0].T
+        Q, p = turn @ Q, centered(p @ turn.T)
+        self._shrinkage = spread(p) / self._size
+        return self.pack(Q, regauged(p, self._size, self._reach))
+
+    def note(self, iteration: int, _: Array, change: float) -> None:
+        """Log an iteration, and adapt the accuracy of the inner solves to its change."""
+        self._inner_tolerance = min(self._inner_tolerance, max(self._tolerance_per_change * change, 1e-13))
+        name = "2W" if self._problem.robust else "2" + self._problem.approach
+        self.log.append(LogEntry(name, iteration, self.cost, change))
 
 
 def _cauchy_weights(cost: InformationCost, Q: Array, p: Array) -> Array:

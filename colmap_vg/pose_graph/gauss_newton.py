@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
-from colmap_vg.linear.reweighted import conjugate_gradients
+from colmap_vg.linear.laplacian import conjugate_gradients
 from colmap_vg.linear.solvers import Factor, SingularMatrixError, factorize
 from colmap_vg.pose_graph.costs import ChordalCost, EdgeTerms, InformationCost, PoseGraphCost
 from colmap_vg.positions.result import check_connected, unit_weights

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.linear.anderson import fixed_point
+from colmap_vg.linear.laplacian import LaplacianSystem
 from colmap_vg.linear.robust_losses import cauchy_loss, cauchy_weight
-from colmap_vg.positions.fixed_point import LaplacianSystem
 from colmap_vg.positions.result import PositionResult, centered, check_connected, spread, unit_weights
 from colmap_vg.positions.shapefit import solve_shapefit
 from colmap_vg.scene.solution import LogEntry

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.linear.anderson import fixed_point
-from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
-from colmap_vg.linear.solvers import Factor, factorize
+from colmap_vg.linear.laplacian import LaplacianSystem
 from colmap_vg.positions.result import PositionResult, centered, check_connected, spread, unit_weights
 from colmap_vg.scene.solution import LogEntry
 
@@ -111,25 +110,6 @@ def solve_fixed_point(
     )
     lengths = np.linalg.norm(p[edges[:, 1]] - p[edges[:, 0]], axis=1)
     return PositionResult(p, lengths, log[-1].cost, count, converged, tuple(log))
-
-
-class LaplacianSystem:
-    """Weighted Laplacian systems of one graph with a fixed sparsity pattern."""
-
-    def __init__(self, num_images: int, edges: IntArray) -> None:
-        self._num_images, self._edges = num_images, edges
-        self._pattern = BlockPattern(num_images, edges, 1)
-
-    def factor(self, weights: Array) -> Factor:
-        block = weights[:, None, None]
-        # The mean is free: damping far below the rounding of the result makes the matrix definite.
-        damping = np.full((self._num_images, 1, 1), 1e-12 * weights.sum() / self._num_images)
-        return factorize(self._pattern.assemble(block, block, -block, damping))
-
-    def right_side(self, weights: Array, directions: Array) -> Array:
-        pulled = weights[:, None] * directions
-        i, j = self._edges[:, 0], self._edges[:, 1]
-        return sum_at_nodes(self._num_images, j, pulled) - sum_at_nodes(self._num_images, i, pulled)
 
 
 def shortest_weighted_length(start: Array, edges: IntArray) -> float:

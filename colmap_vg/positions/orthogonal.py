@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.linear.anderson import fixed_point
+from colmap_vg.linear.laplacian import LaplacianSystem
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.positions.cross import sine_cost
-from colmap_vg.positions.fixed_point import LaplacianSystem
 from colmap_vg.positions.result import PositionResult, centered, check_connected, spread, unit_weights
 from colmap_vg.scene.solution import LogEntry
 

@@ -165,20 +165,14 @@ def relative_poses(
     -------
     PairGeometry
     """
-    m = len(tables.pairs)
     every = _Matches(offsets, bearings1, bearings2)
     matches = every.thinned(MAX_MATCHES_PER_POSE)
     cameras = tables.camera_idx[tables.pairs]
     K = np.array([calibration_matrix(c, s) for c, s in zip(tables.cameras, focal_scales, strict=True)])
     K = K.reshape(-1, 3, 3)
-    K1, K2 = K[cameras[:, 0]], K[cameras[:, 1]]
-    unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
-
-    few = every.thinned(MAX_MATCHES_PER_CHOICE)
-    E = _essential_matrices(tables, few, K1, K2, unchanged)
-    poses = _better_of_stored_and_decomposed(tables, few, E, unchanged)
     planar = np.isin(tables.configs, (PLANAR, PLANAR_OR_PANORAMIC))
-    poses = _better_planar(tables, few, K1, K2, planar, poses)
+    unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
+    poses = _initial_poses(tables, every.thinned(MAX_MATCHES_PER_CHOICE), K[cameras], planar, unchanged)
     focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
     enough = np.diff(matches.offsets) >= max(min_num_inliers, 5)
     refined = refine_relative_poses(
@@ -193,24 +187,63 @@ def relative_poses(
     rotations = np.where(enough[:, None, None], refined.rotations, poses.rotations)
     directions = np.where(enough[:, None], refined.directions, poses.directions)
     final = matches.judged(rotations, normalized(directions))
-    errors = matches.errors(final)
-    medians, pair_focal = matches.medians(errors), np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]])
-    turned = _pure_rotation(matches, final, medians)
-    final = replace(final, rotations=np.where(turned[0][:, None, None], turned[1], final.rotations))
-    error_px = medians * pair_focal
-    verdicts = np.full(m, EdgeVerdict.KEPT, dtype=object)
-    verdicts[turned[0] | (tables.configs == PANORAMIC)] = EdgeVerdict.ROTATION_ONLY
-    unexplained = (final.share_in_front < MIN_SHARE_IN_FRONT) & (verdicts == EdgeVerdict.KEPT)
-    verdicts[unexplained | ((error_px > MAX_MEDIAN_ERROR_PX) & ~turned[0])] = EdgeVerdict.NO_POSE
+    errors, pair_focal = matches.errors(final), np.sqrt(focal[cameras[:, 0]] * focal[cameras[:, 1]])
+    medians = matches.medians(errors)
+    still, turns = _pure_rotation(matches, final, medians)
+    final = replace(final, rotations=np.where(still[:, None, None], turns, final.rotations))
+    num_matches = np.diff(every.offsets)
     fitting = matches.shares_within(errors, MAX_MEDIAN_ERROR_PX / pair_focal)
-    unfit = (fitting < MIN_FITTING_SHARE) | (fitting * np.diff(every.offsets) < MIN_NUM_FITTING)
-    verdicts[(tables.configs == UNCALIBRATED) & focal_trusted[cameras].all(axis=1) & unfit] = EdgeVerdict.UNCALIBRATED
-    verdicts[tables.configs == WATERMARK] = EdgeVerdict.WATERMARK
-    verdicts[tables.configs == DEGENERATE] = EdgeVerdict.DEGENERATE
-    verdicts[np.diff(every.offsets) < min_num_inliers] = EdgeVerdict.FEW_INLIERS
-    return PairGeometry(
-        final.rotations, final.directions, final.median_angles, refined.information, planar, verdicts.astype(str)
+    unfit = (fitting < MIN_FITTING_SHARE) | (fitting * num_matches < MIN_NUM_FITTING)
+    verdicts = _verdicts(
+        tables.configs,
+        final.share_in_front,
+        medians * pair_focal,
+        still=still,
+        refuted=focal_trusted[cameras].all(axis=1) & unfit,
+        few=num_matches < min_num_inliers,
     )
+    return PairGeometry(final.rotations, final.directions, final.median_angles, refined.information, planar, verdicts)
+
+
+def _verdicts(
+    configs: IntArray, share_in_front: Array, error_px: Array, *, still: BoolArray, refuted: BoolArray, few: BoolArray
+) -> NDArray[np.str_]:
+    """Verdict of each pair (m,); the last reason that applies wins.
+
+    Parameters
+    ----------
+    configs : (m,) int array
+        COLMAP's configurations.
+    share_in_front : (m,) array
+        Share of the matches in front of both cameras.
+    error_px : (m,) array
+        Median error of the matches, pixels.
+    still : (m,) bool array
+        Pairs that a pure rotation explains.
+    refuted : (m,) bool array
+        Pairs of trusted focal lengths whose matches do not fit them.
+    few : (m,) bool array
+        Pairs with too few matches.
+    """
+    verdicts = np.full(len(configs), EdgeVerdict.KEPT, dtype=object)
+    verdicts[still | (configs == PANORAMIC)] = EdgeVerdict.ROTATION_ONLY
+    unexplained = (share_in_front < MIN_SHARE_IN_FRONT) & (verdicts == EdgeVerdict.KEPT)
+    verdicts[unexplained | ((error_px > MAX_MEDIAN_ERROR_PX) & ~still)] = EdgeVerdict.NO_POSE
+    verdicts[(configs == UNCALIBRATED) & refuted] = EdgeVerdict.UNCALIBRATED
+    verdicts[configs == WATERMARK] = EdgeVerdict.WATERMARK
+    verdicts[configs == DEGENERATE] = EdgeVerdict.DEGENERATE
+    verdicts[few] = EdgeVerdict.FEW_INLIERS
+    return verdicts.astype(str)
+
+
+def _initial_poses(
+    tables: DatabaseTables, matches: _Matches, K: Array, planar: BoolArray, unchanged: BoolArray
+) -> RelativePoses:
+    """Best of each pair's stored pose and those of its matrices, with its cameras' calibrations K (m, 2, 3, 3)."""
+    K1, K2 = K[:, 0], K[:, 1]
+    E = _essential_matrices(tables, matches, K1, K2, unchanged)
+    poses = _better_of_stored_and_decomposed(tables, matches, E, unchanged)
+    return _better_planar(tables, matches, K1, K2, planar, poses)
 
 
 def _essential_matrices(tables: DatabaseTables, matches: _Matches, K1: Array, K2: Array, unchanged: BoolArray) -> Array:

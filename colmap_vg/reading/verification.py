@@ -17,6 +17,7 @@ from colmap_vg.colmap_io.tables import CALIBRATED, DEGENERATE, UNCALIBRATED, UND
 from colmap_vg.colmap_io.undistortion import undistorted_keypoints
 from colmap_vg.geometry import so3
 from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
+from colmap_vg.two_view.sampson_errors import pixel_sampson_errors
 from colmap_vg.two_view.segments import (
     evenly_thinned,
     rows_of_segments,
@@ -76,7 +77,7 @@ def with_verified_geometries(
     seen = valid[first] & valid[second]
     points1, points2, offsets = undistorted[first[seen]], undistorted[second[seen]], segment_subset(offsets, seen)
     F = estimate_fundamental_from_inliers(offsets, points1, points2)
-    agree = np.abs(epipolar_distances(F, offsets, points1, points2)) <= MAX_ERROR_PX
+    agree = np.abs(pixel_sampson_errors(F, offsets, points1, points2)) <= MAX_ERROR_PX
     shares = segment_sums(offsets, agree.astype(float)) / np.maximum(np.diff(offsets), 1)
     configs, matrices = tables.configs.copy(), {name: getattr(tables, name).copy() for name in ("E", "F", "H")}
     for matrix in matrices.values():
@@ -121,21 +122,11 @@ def _explained(tables: DatabaseTables, pixels: tuple[Array, ...]) -> BoolArray:
     of_E, of_pose = (np.swapaxes(K[camera2], 1, 2) @ E @ K[camera1] for E in (tables.E, of_pose))
     explained = np.zeros(len(every), dtype=bool)
     for points in pixels:
-        epipolar = ((matrix, epipolar_distances) for matrix in (tables.F, of_E, of_pose))
+        epipolar = ((matrix, pixel_sampson_errors) for matrix in (tables.F, of_E, of_pose))
         for matrix, distance in (*epipolar, (tables.H, transfers)):
             far = np.abs(distance(matrix, offsets, points[first], points[second]))
             explained |= segment_quantiles(offsets, np.nan_to_num(far, nan=FAR, posinf=FAR)) <= MAX_ERROR_PX
     return explained
-
-
-def epipolar_distances(F: Array, offsets: IntArray, points1: Array, points2: Array) -> Array:
-    """Sampson distances (k,) of matches, pixels."""
-    F = F[segment_of_rows(offsets)]
-    x1, x2 = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (points1, points2))
-    line2, line1 = np.einsum("kab,kb->ka", F, x1), np.einsum("kab,ka->kb", F, x2)
-    length = np.sqrt((line2[:, :2] ** 2).sum(axis=1) + (line1[:, :2] ** 2).sum(axis=1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.einsum("ka,ka->k", x2, line2) / length)
 
 
 def transfers(H: Array, offsets: IntArray, points1: Array, points2: Array) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from colmap_vg.geometry import so3
 from colmap_vg.linear.eigen import smallest_eigenpairs
-from colmap_vg.linear.reweighted import ReweightedLaplacian
+from colmap_vg.linear.laplacian import ReweightedLaplacian
 from colmap_vg.linear.solvers import Factor, factorize
 from colmap_vg.rotations.chordal_matrix import TangentQuadratic, chordal_cost, chordal_matrix
 from colmap_vg.rotations.problem import RotationResult, checked_initial, checked_problem

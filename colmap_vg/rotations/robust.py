@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from colmap_vg.geometry import quaternions
-from colmap_vg.linear.reweighted import ReweightedLaplacian
+from colmap_vg.linear.laplacian import ReweightedLaplacian
 from colmap_vg.linear.robust_losses import geman_mcclure_weight
 from colmap_vg.rotations.problem import RotationResult, checked_initial, checked_problem
 from colmap_vg.rotations.spanning_tree import rotations_from_spanning_tree

@@ -81,16 +81,7 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
         positive.
     """
     noise = noise or ObjectNoise()
-    num_pairs = num_images * (num_images - 1) // 2
-    if num_images < 8 or not 4 * num_images <= num_edges <= num_pairs:
-        raise OptionError(
-            f"object_scene: {num_edges} pairs of {num_images} images; use at least 8 images, and from "
-            f"{4 * num_images} to {num_pairs} pairs"
-        )
-    if not (noise.rotation_deg > 0 and noise.direction_deg > 0):
-        raise OptionError("object_scene: rotation_deg and direction_deg must be positive")
-    if not (0 <= noise.hardness <= 1 and 0 <= noise.coherent_share <= 1):
-        raise OptionError("object_scene: hardness and coherent_share must lie between 0 and 1")
+    _check_request(num_images, num_edges, noise)
     rng = np.random.default_rng(seed)
     R, p = _cameras(num_images, rng)
     drawn = np.exp(np.log(MEDIAN_INLIERS) + INLIER_SPREAD * rng.standard_normal(num_edges))
@@ -107,17 +98,7 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
     relative = np.concatenate([relative, wrong_relative])
     direction = np.concatenate([direction, wrong_direction])
     counts = np.concatenate([inliers[~wrong], rng.permutation(inliers[wrong])])
-    # The precision of a pair does not depend on whether it is true.
-    fewness = np.sqrt(MEDIAN_INLIERS / rng.permutation(counts)) * np.exp(0.3 * rng.standard_normal(num_edges))
-    rotation_sigma, direction_sigma = (
-        np.radians(noise.rotation_deg) * fewness,
-        np.radians(noise.direction_deg) * fewness,
-    )
-    relative = so3.exp((1.0 + noise.focal_error) * so3.log(relative))
-    relative = so3.exp(rotation_sigma[:, None] * rng.standard_normal((num_edges, 3))) @ relative
-    direction = np.einsum(
-        "kab,kb->ka", so3.exp(direction_sigma[:, None] * rng.standard_normal((num_edges, 3))), direction
-    )
+    relative, direction, rotation_sigma, direction_sigma = _with_noise(relative, direction, counts, noise, rng)
     order = rng.permutation(num_edges)
     precisions = np.stack([rotation_sigma] * 3 + [direction_sigma] * 2, axis=1)[order] ** -2.0
     graph = ViewGraph(
@@ -129,6 +110,39 @@ def object_scene(num_images: int, num_edges: int, noise: ObjectNoise | None = No
         edge_information=precisions[:, :, None] * np.eye(5),
     )
     return SyntheticScene(graph, R, p, np.arange(num_edges)[order] >= num_true)
+
+
+def _check_request(num_images: int, num_edges: int, noise: ObjectNoise) -> None:
+    """Raise `OptionError` for numbers and noise that `object_scene` cannot simulate."""
+    num_pairs = num_images * (num_images - 1) // 2
+    if num_images < 8 or not 4 * num_images <= num_edges <= num_pairs:
+        raise OptionError(
+            f"object_scene: {num_edges} pairs of {num_images} images; use at least 8 images, and from "
+            f"{4 * num_images} to {num_pairs} pairs"
+        )
+    if not (noise.rotation_deg > 0 and noise.direction_deg > 0):
+        raise OptionError("object_scene: rotation_deg and direction_deg must be positive")
+    if not (0 <= noise.hardness <= 1 and 0 <= noise.coherent_share <= 1):
+        raise OptionError("object_scene: hardness and coherent_share must lie between 0 and 1")
+
+
+def _with_noise(
+    relative: Array, direction: Array, inliers: IntArray, noise: ObjectNoise, rng: np.random.Generator
+) -> tuple[Array, Array, Array, Array]:
+    """Relative rotations and directions with noise, and its standard deviations in radians, (m,) each."""
+    num_edges = len(relative)
+    # The precision of a pair does not depend on whether it is true.
+    fewness = np.sqrt(MEDIAN_INLIERS / rng.permutation(inliers)) * np.exp(0.3 * rng.standard_normal(num_edges))
+    rotation_sigma, direction_sigma = (
+        np.radians(noise.rotation_deg) * fewness,
+        np.radians(noise.direction_deg) * fewness,
+    )
+    relative = so3.exp((1.0 + noise.focal_error) * so3.log(relative))
+    relative = so3.exp(rotation_sigma[:, None] * rng.standard_normal((num_edges, 3))) @ relative
+    direction = np.einsum(
+        "kab,kb->ka", so3.exp(direction_sigma[:, None] * rng.standard_normal((num_edges, 3))), direction
+    )
+    return relative, direction, rotation_sigma, direction_sigma
 
 
 def symmetric_object_scene(

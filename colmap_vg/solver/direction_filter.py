@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.geometry.directions import angle_between
+from colmap_vg.linear.laplacian import LaplacianSystem
 from colmap_vg.linear.robust_losses import geman_mcclure_weight
-from colmap_vg.positions.fixed_point import LaplacianSystem, edge_lengths
+from colmap_vg.positions.fixed_point import edge_lengths
 from colmap_vg.positions.lud import solve_lud
 from colmap_vg.positions.result import centered, spread, unit_weights
 

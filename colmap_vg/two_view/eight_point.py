@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_vg.linear.robust_losses import cauchy_weight
 from colmap_vg.two_view.essential import nearest_essential
 from colmap_vg.two_view.pieces import Pieces
+from colmap_vg.two_view.sampson_errors import squared_errors_and_variances
 from colmap_vg.two_view.segments import segment_quantiles, segment_sums
 
 Array = NDArray[np.float64]
@@ -176,16 +177,7 @@ def weighted_moments(pieces: Pieces, weights: Array) -> Array:
 
 def _sampson_weights(E: Array, pieces: Pieces, min_scale: float, on_sphere: bool) -> Array:
     """Cauchy weights of the Sampson errors, divided by the variances of the algebraic errors: (p, length)."""
-    squared, variance = np.empty((2, len(pieces.counts), pieces.columns.shape[2]))
-    for block in pieces.blocks():
-        columns, E_of = pieces.columns[block.pieces], E[pieces.segments[block.pieces]]
-        line2 = E_of @ columns[:, :3]
-        line1 = np.swapaxes(E_of, 1, 2) @ columns[:, 3:]
-        algebraic = np.square(np.einsum("pak,pak->pk", columns[:, 3:], line2))
-        spread = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1)
-        if on_sphere:
-            spread += np.square(line1[:, 2]) + np.square(line2[:, 2]) - 2.0 * algebraic
-        squared[block.pieces], variance[block.pieces] = algebraic, spread
+    squared, variance = squared_errors_and_variances(E, pieces, on_sphere=on_sphere)
     # The variance of a match near both epipoles vanishes: without a floor its weight would exceed all others.
     # Where all keypoints coincide, only the last term keeps the moments finite.
     offsets = pieces.offsets

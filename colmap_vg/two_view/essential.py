@@ -1,4 +1,4 @@
-"""Essential and fundamental matrices of all edges: conversion, Sampson errors, and relative poses by cheirality.
+"""Essential and fundamental matrices of all edges: conversion, and relative poses by cheirality.
 
 With ``cam2_from_cam1 = (R, t)`` a match satisfies ``x2^T E x1 = 0``, ``E = [t]_x R = -R [d]_x``, where
 ``d = -R^T t`` is the direction of camera 2's centre in camera 1's frame (Hartley & Zisserman, Multiple View Geometry,
@@ -83,52 +83,6 @@ def nearest_essential(M: Array) -> Array:
     """Nearest essential matrices with singular values (1, 1, 0), in the Frobenius norm up to scale: (m, 3, 3)."""
     U, _, Vt = np.linalg.svd(M)
     return np.asarray(U[..., :, :2] @ Vt[..., :2, :])
-
-
-def sampson_errors(
-    E: Array,
-    offsets: IntArray,
-    bearings1: Array,
-    bearings2: Array,
-    focal_lengths1: Array | None = None,
-    focal_lengths2: Array | None = None,
-) -> Array:
-    """Signed Sampson error of each match, the first-order distance from its epipolar constraint on the unit sphere.
-
-    ``x2^T E x1 / sqrt(|P1 E^T x2|^2 / f1^2 + |P2 E x1|^2 / f2^2)`` with the projection ``P = I - x x^T`` on the tangent
-    plane of a bearing, which is valid for any field of view.
-
-    Parameters
-    ----------
-    E : (m, 3, 3) array
-        Essential matrices, of any scale.
-    offsets : (m + 1,) int array
-        Matches of edge k are rows ``offsets[k]:offsets[k + 1]``.
-    bearings1, bearings2 : (k, 3) array
-        Unit rays.
-    focal_lengths1, focal_lengths2 : (m,) array, optional
-        Focal lengths of each edge's cameras in pixels.
-
-    Returns
-    -------
-    (k,) array
-        Radians, or pixels if focal lengths are given. Zero for a match at both epipoles.
-    """
-    edge = segment_of_rows(offsets)
-    row_E = E[edge]
-    line2 = np.einsum("kij,kj->ki", row_E, bearings1)
-    line1 = np.einsum("kij,ki->kj", row_E, bearings2)
-    algebraic = np.einsum("ki,ki->k", bearings2, line2)
-    squared = np.square(algebraic)
-    variance1 = np.einsum("ki,ki->k", line1, line1) - squared
-    variance2 = np.einsum("ki,ki->k", line2, line2) - squared
-    if focal_lengths1 is not None:
-        variance1 = variance1 / np.square(focal_lengths1)[edge]
-    if focal_lengths2 is not None:
-        variance2 = variance2 / np.square(focal_lengths2)[edge]
-    variance = variance1 + variance2
-    good = variance > 0
-    return np.asarray(np.where(good, algebraic / np.sqrt(np.where(good, variance, 1.0)), 0.0))
 
 
 def in_front_of_both(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, MAD_TO_SIGMA, cauchy_weight
 from colmap_vg.two_view.eight_point import cofactors, weighted_moments
 from colmap_vg.two_view.pieces import Pieces
+from colmap_vg.two_view.sampson_errors import squared_errors_and_variances
 from colmap_vg.two_view.segments import segment_quantiles
 
 Array = NDArray[np.float64]
@@ -79,13 +80,8 @@ def fundamental_covariances(
 def _information(offsets: IntArray, points1: Array, points2: Array, F: Array, min_sigma: float) -> tuple[Array, Array]:
     ones = np.ones(len(points1))
     pieces = Pieces.cut(offsets, [*points1.T, ones, *points2.T, ones])
-    squared, variance = np.empty((2, len(pieces.counts), pieces.columns.shape[2]))
-    for block in pieces.blocks():
-        columns, F_of = pieces.columns[block.pieces], F[pieces.segments[block.pieces]]
-        line2 = F_of @ columns[:, :3]
-        line1 = np.swapaxes(F_of, 1, 2) @ columns[:, 3:]
-        variance[block.pieces] = np.square(line1[:, :2]).sum(axis=1) + np.square(line2[:, :2]).sum(axis=1) + 1e-300
-        squared[block.pieces] = np.square(np.einsum("pak,pak->pk", columns[:, 3:], line2))
+    squared, variance = squared_errors_and_variances(F, pieces, on_sphere=False)
+    variance += 1e-300
     squared /= variance
     count = np.diff(offsets)
     median = np.sqrt(segment_quantiles(offsets, pieces.rows(squared)))

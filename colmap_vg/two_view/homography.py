@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import angle_between, normalized
-from colmap_vg.two_view.essential import RelativePoses, check_cheirality, essential_from_pose, sampson_errors
+from colmap_vg.two_view.essential import RelativePoses, check_cheirality, essential_from_pose
+from colmap_vg.two_view.sampson_errors import sampson_errors
 from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_sums
 
 Array = NDArray[np.float64]

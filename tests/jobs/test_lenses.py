@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 from synthetic_databases import centers, look_at, make_database
 
-from colmap_vg import MappingOptions, align_positions, read_view_graph
-from colmap_vg.colmap_io.reconstruction import loaded_cache
+from colmap_vg import MappingOptions, ReadOptions, align_positions, read_view_graph, solve_view_graph
+from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.reading.distortion import undistorted
@@ -136,6 +136,21 @@ def test_poses_without_points_have_the_lens_that_was_found(tmp_path: Path) -> No
     with loaded_cache(tmp_path / "a.db", tmp_path, 15, graph=graph) as (cache, _):
         assert cache.camera(1).params[3] == pytest.approx(graph.found_radial_terms[0])
     assert (tmp_path / "a.db").read_bytes() == before
+
+
+def test_a_radial_term_that_the_solver_finds_reaches_the_camera(tmp_path: Path) -> None:
+    stored = camera("SIMPLE_RADIAL", (1.2 * WIDTH, 600.0, 450.0, 0.0))
+    stored.has_prior_focal_length = False
+    write_room(tmp_path / "a.db", camera("SIMPLE_RADIAL", (600.0, 600.0, 450.0, -0.1)), stored)
+    graph = read_view_graph(tmp_path / "a.db", ReadOptions(find_distortion=False))
+    solution = solve_view_graph(graph)
+    assert solution.registered.all()
+    focal, term = graph.camera_focal_lengths[0] * solution.focal_scales[0], solution.radial_terms[0]
+    assert abs(focal / 600.0 - 1.0) < 0.01
+    assert abs(term + 0.1) < 0.005
+    with loaded_cache(tmp_path / "a.db", tmp_path, 15, graph=graph) as (cache, _):
+        model = reconstruction_from_solution(cache, solution, graph)
+    np.testing.assert_allclose(model.camera(1).params, [focal, 600.0, 450.0, term], rtol=1e-12)
 
 
 def test_distortion_is_not_looked_for_where_it_must_stay(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_vg.linear.assembly import BlockPattern, incidence, laplacian, sum_at_nodes
+from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
 
 
 def _edges(num_nodes, num_edges, rng):
@@ -36,18 +36,6 @@ def test_block_systems(num_nodes, num_edges, b, seed):
     assert found.has_canonical_format
     # A second assembly on the same pattern does not see the first.
     assert np.allclose(pattern.assemble(2 * ii, 2 * jj, 2 * ij, 2 * diagonal).toarray(), 2 * expected, atol=1e-12)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(2, 8), st.integers(1, 20), st.integers(0, 10_000))
-def test_incidence_and_laplacian(num_nodes, num_edges, seed):
-    rng = np.random.default_rng(seed)
-    edges, weights, p = _edges(num_nodes, num_edges, rng), rng.random(num_edges), rng.standard_normal((num_nodes, 3))
-    difference = p[edges[:, 1]] - p[edges[:, 0]]
-    assert np.allclose(incidence(num_nodes, edges) @ p, difference)
-    L = laplacian(num_nodes, edges, weights)
-    assert np.sum(p * (L @ p)) == pytest.approx(np.sum(weights[:, None] * difference**2))
-    assert np.allclose(L.toarray(), L.toarray().T)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 4), (3, 3)])

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from graph_matrices import laplacian
 
-from colmap_vg.linear import eigen, reweighted
-from colmap_vg.linear.assembly import laplacian
+from colmap_vg.linear import eigen
+from colmap_vg.linear import laplacian as module
 from colmap_vg.linear.eigen import smallest_eigenpairs
-from colmap_vg.linear.reweighted import ReweightedLaplacian, conjugate_gradients
+from colmap_vg.linear.laplacian import LaplacianSystem, ReweightedLaplacian, conjugate_gradients
 from colmap_vg.linear.solvers import SingularMatrixError, factorize
 
 
@@ -44,6 +45,21 @@ def test_indefinite_and_singular_matrices_are_told():
 
 
 @pytest.mark.parametrize("n", [30, 900])
+def test_laplacian_system(n):
+    rng = np.random.default_rng(2)
+    edges, _ = _ring(n, rng)
+    edges = np.concatenate([edges, edges[:7, ::-1]])
+    system, x = LaplacianSystem(n, edges), rng.standard_normal((n, 3))
+    x -= x.mean(axis=0)
+    for _ in range(2):
+        weights = rng.uniform(0.1, 2.0, len(edges))
+        b = system.right_side(weights, x[edges[:, 1]] - x[edges[:, 0]])
+        assert np.allclose(b, laplacian(n, edges, weights) @ x, atol=1e-12)
+        found = system.factor(weights).solve(b)
+        assert np.allclose(found - found.mean(axis=0), x, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [30, 900])
 def test_reweighted_laplacian(n, monkeypatch):
     rng = np.random.default_rng(1)
     edges, weights = _ring(n, rng)
@@ -51,7 +67,7 @@ def test_reweighted_laplacian(n, monkeypatch):
     weights = rng.uniform(0.1, 2.0, len(edges))
     system = ReweightedLaplacian(n, edges, max_cg_iterations=40)
     factored = []
-    monkeypatch.setattr(reweighted, "factorize", lambda A, **how: factored.append(1) or factorize(A, **how))
+    monkeypatch.setattr(module, "factorize", lambda A, **how: factored.append(1) or factorize(A, **how))
     for change in (0.0, 0.1, 0.1, 3.0):
         weights = weights * np.exp(change * rng.standard_normal(len(edges)))
         L = laplacian(n, edges, weights)

@@ -1,11 +1,15 @@
 """Databases of scenes in which only chosen pairs are matched: streets, parts with few links, chains."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from synthetic_databases import changed_copy, look_at, pair_id
+
+from colmap_vg import ViewGraph
+from colmap_vg.geometry import so3
 
 WIDTH, HEIGHT, FOCAL = 1024, 768, 1000.0
 
@@ -112,3 +116,14 @@ def only_pairs(path: Path, target: Path, pairs: Iterable[tuple[int, int]]) -> Pa
     kept = ", ".join(str(pair_id(*sorted(pair))) for pair in pairs)
     delete = "DELETE FROM {} WHERE pair_id NOT IN ({})"
     return changed_copy(path, target, *(delete.format(table, kept) for table in ("matches", "two_view_geometries")))
+
+
+def turned(graph: ViewGraph, edge: int, degrees: float, *, with_matches: bool) -> ViewGraph:
+    """The graph with the second camera of an edge turned in its relative rotation, and its rays likewise or not."""
+    turn = so3.exp(np.radians([[0.0, degrees, 0.0]]))[0]
+    R, rays = graph.cam2_from_cam1_rotations.copy(), graph.inlier_bearings2.copy()
+    R[edge] = turn @ R[edge]
+    rows = slice(*graph.inlier_offsets[edge : edge + 2].tolist())
+    if with_matches:
+        rays[rows] = rays[rows] @ turn.T
+    return replace(graph, cam2_from_cam1_rotations=R, inlier_bearings2=rays)

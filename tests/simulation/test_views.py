@@ -9,7 +9,8 @@ from colmap_vg.geometry import so3
 from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.views import FOCAL_PX, HEIGHT, WIDTH, synthetic_views
-from colmap_vg.two_view.essential import essential_from_pose, sampson_errors
+from colmap_vg.two_view.essential import essential_from_pose
+from colmap_vg.two_view.sampson_errors import sampson_errors
 
 
 def rays(pixels):

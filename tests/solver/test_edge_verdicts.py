@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from linked_scenes import near, street, write_scene
+from linked_scenes import near, street, turned, write_scene
 
 from colmap_vg import EdgeVerdict, SolutionStatus, SolveOptions, ViewGraph, read_view_graph, solve_view_graph
-from colmap_vg.geometry import so3
 from colmap_vg.simulation.ring_scenes import ring_scene
 
 EDGE = 20
@@ -19,17 +18,6 @@ def graph(tmp_path_factory: pytest.TempPathFactory) -> ViewGraph:
     poses, points = street(14, 1)
     write_scene(path, poses, points, near(14, 3), seed=1)
     return read_view_graph(path)
-
-
-def turned(graph: ViewGraph, edge: int, degrees: float, *, with_matches: bool) -> ViewGraph:
-    """The graph with the second camera of an edge turned in its relative rotation, and its rays likewise or not."""
-    turn = so3.exp(np.radians([[0.0, degrees, 0.0]]))[0]
-    R, rays = graph.cam2_from_cam1_rotations.copy(), graph.inlier_bearings2.copy()
-    R[edge] = turn @ R[edge]
-    rows = slice(*graph.inlier_offsets[edge : edge + 2].tolist())
-    if with_matches:
-        rays[rows] = rays[rows] @ turn.T
-    return replace(graph, cam2_from_cam1_rotations=R, inlier_bearings2=rays)
 
 
 def test_a_pair_whose_pose_and_matches_are_off_contradicts_the_poses(graph: ViewGraph) -> None:

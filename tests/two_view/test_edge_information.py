@@ -12,7 +12,8 @@ from colmap_vg.geometry.directions import normalized, tangent_basis
 from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY
 from colmap_vg.two_view import sampson
 from colmap_vg.two_view.edge_information import refine_relative_poses
-from colmap_vg.two_view.essential import essential_from_pose, sampson_errors
+from colmap_vg.two_view.essential import essential_from_pose
+from colmap_vg.two_view.sampson_errors import sampson_errors
 
 
 def _refine(data, rotations, directions, focal1, focal2, **kwargs):

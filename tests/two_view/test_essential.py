@@ -16,7 +16,6 @@ from colmap_vg.two_view.essential import (
     in_front_of_both,
     nearest_essential,
     poses_from_essential,
-    sampson_errors,
 )
 
 
@@ -55,28 +54,6 @@ def test_rays_in_front_agree_with_least_squares_depths():
         depths = np.linalg.lstsq(np.stack([R[0] @ x1, -x2], axis=1), R[0] @ d[0], rcond=None)[0]
         assert said == (depths > 0).all()
     assert 0 < found.sum() < 200
-
-
-def test_sampson_error_is_the_distance_to_the_nearest_pair_that_fits():
-    data = matched_rays(3, [40], sigma=1e-3)
-    E = essential_from_pose(data.rotations, data.directions)
-    errors = sampson_errors(E, data.offsets, data.bearings1, data.bearings2)
-    f1, f2 = np.array([900.0]), np.array([400.0])
-    in_px = sampson_errors(E, data.offsets, data.bearings1, data.bearings2, f1, f2)
-    for k in range(40):
-        assert abs(errors[k]) == pytest.approx(_distance(E[0], data.bearings1[k], data.bearings2[k], 1, 1), rel=1e-2)
-        assert abs(in_px[k]) == pytest.approx(_distance(E[0], data.bearings1[k], data.bearings2[k], 900, 400), rel=1e-2)
-
-
-def _distance(E, x1, x2, f1, f2):
-    """Newton steps on the constraint in the four tangent coordinates, in pixels."""
-    u1, u2 = (np.linalg.svd(x[None])[2][1:].T for x in (x1, x2))
-    delta = np.zeros(4)
-    for _ in range(20):
-        a, b = x1 + u1 @ delta[:2] / f1, x2 + u2 @ delta[2:] / f2
-        gradient = np.concatenate([u1.T @ E.T @ b / f1, u2.T @ E @ a / f2])
-        delta = gradient * (gradient @ delta - b @ E @ a) / (gradient @ gradient)
-    return np.linalg.norm(delta)
 
 
 @pytest.mark.real_data

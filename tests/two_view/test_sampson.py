@@ -6,7 +6,8 @@ from matched_rays import matched_rays
 
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.two_view import sampson
-from colmap_vg.two_view.essential import essential_from_pose, sampson_errors
+from colmap_vg.two_view.essential import essential_from_pose
+from colmap_vg.two_view.sampson_errors import sampson_errors
 
 FOCALS1, FOCALS2 = np.array([900.0, 800.0, 700.0]), np.array([400.0, 500.0, 600.0])
 

@@ -1,17 +1,47 @@
-"""Graph Laplacians with changing weights and a fixed pattern, for iteratively reweighted least squares.
+"""Linear systems with weighted graph Laplacians of one graph: a fixed sparsity pattern and changing weights.
 
-As the weights converge, an old factorisation remains a good preconditioner: conjugate gradients with it need a few
-products instead of a new factorisation (0.45 x of the time at 5,000 to 30,000 cameras).
+:class:`LaplacianSystem` factors the matrix for each set of weights. :class:`ReweightedLaplacian` is for iteratively
+reweighted least squares: as the weights converge, an old factorisation remains a good preconditioner, and conjugate
+gradients with it need a few products instead of a new factorisation (0.45 x of the time at 5,000 to 30,000 cameras).
 """
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
 from colmap_vg.linear.solvers import Factor, factorize
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+class LaplacianSystem:
+    """Matrices ``B^T diag(w) B`` and right sides ``B^T diag(w) d`` of a graph with incidence matrix B.
+
+    Parameters
+    ----------
+    num_nodes : int
+    edges : (m, 2) int array
+        Parallel and reversed edges are summed.
+    """
+
+    def __init__(self, num_nodes: int, edges: IntArray) -> None:
+        self._num_nodes, self._edges = num_nodes, edges
+        self._pattern = BlockPattern(num_nodes, edges, 1)
+
+    def factor(self, weights: Array) -> Factor:
+        """Factor the Laplacian of weights (m,), with a slight damping."""
+        block = weights[:, None, None]
+        # The mean is free: damping far below the rounding of the result makes the matrix definite.
+        damping = np.full((self._num_nodes, 1, 1), 1e-12 * weights.sum() / self._num_nodes)
+        return factorize(self._pattern.assemble(block, block, -block, damping))
+
+    def right_side(self, weights: Array, differences: Array) -> Array:
+        """Right side (n, 3) of weighted differences (m, 3), second node minus first node."""
+        pulled = weights[:, None] * differences
+        i, j = self._edges[:, 0], self._edges[:, 1]
+        return sum_at_nodes(self._num_nodes, j, pulled) - sum_at_nodes(self._num_nodes, i, pulled)
 
 
 class ReweightedLaplacian:
