@@ -108,7 +108,7 @@ class FeatureOptions(_Checked):
     matching: Matching = "auto"  # auto: exhaustive for up to 20 images, else selected (by the largest features)
     image_list_path: str | PathLike[str] | None = None  # file with one image name per line; None: all in the folder
     mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png or NAME.jpg of image NAME; black is masked
-    max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are resized; -1: COLMAP's default
+    max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are resized; -1: 3200
     max_num_features: int = _number(8192, 1)  # per image
     sequential_overlap: int = _number(10, 1)  # images; each is matched with this many that follow it
     num_threads: int = _number(-1, -1)  # -1: all cores

@@ -129,7 +129,7 @@ class FeatureFlags:
         int | None,
         typer.Option(
             "--max_image_size",
-            help="Longer side to which larger images are scaled down, in pixels. -1: COLMAP's default.",
+            help="Longer side to which larger images are scaled down, in pixels. -1: 3200.",
         ),
     ] = None
     max_num_features: Annotated[
