@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -119,6 +120,8 @@ def _talk(process: "subprocess.Popen[bytes]", request: bytes, log: StageLog) -> 
         stdin.write(_LENGTH.pack(len(request)) + request)
         stdin.flush()  # but not closed: the process ends itself when this pipe closes
     except BrokenPipeError:
+        with suppress(BrokenPipeError):
+            stdin.close()  # what is left in its buffer cannot be written
         return None
     answer = None
     for line in stdout:
@@ -190,7 +193,7 @@ def _request(pipe: IO[bytes]) -> bytes | None:
 
 
 def _end_with(pipe: IO[bytes]) -> None:
-    pipe.read()
+    os.read(pipe.fileno(), 1)  # not by the buffer, whose lock would be held when this process ends
     os._exit(1)
 
 

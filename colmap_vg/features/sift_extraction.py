@@ -55,12 +55,14 @@ def extract_sift(
     ):
         ids = {image.name: image.image_id for image in database.read_all_images()}
         todo = [name for name in names if not _has_features(database, ids[name])]
+        before = len(names) - len(todo)
+        log.progress(f"{before} of {len(names)} photographs", before / len(names), before)
         waiting: list[tuple[int, Future[Features]]] = []
         for count, name in enumerate(todo):
             waiting.append((ids[name], pool.submit(image_features, Path(image_path), name, options)))
             if len(waiting) >= _WAITING_PER_THREAD * workers:
                 _write(database, *waiting.pop(0))
-                done = len(names) - len(todo) + count + 1 - len(waiting)
+                done = before + count + 1 - len(waiting)
                 log.progress(f"{done} of {len(names)} photographs", done / len(names), done)
         for image_id, features in waiting:
             _write(database, image_id, features)

@@ -125,6 +125,9 @@ def make_database(
             return FeatureResult(readable, tuple(skipped), _num_verified(finished))
         if resume and record_path.exists() and not same:
             log.warn(f"{work} was made from other photographs or with other options: features are extracted again")
+        if same and unfinished.exists() and not _is_whole(unfinished):
+            log.warn(f"{unfinished} is damaged: features are extracted again")
+            same = False
         if not same:
             _remove_previous(finished, unfinished, record_path, record)
         with readable_folder(image_path, photographs, options, work / COPIES_NAME) as (folder, reading):
@@ -184,6 +187,14 @@ def image_names(database_path: Path) -> list[str]:
         The file is damaged.
     """
     return [str(row[0]) for row in _query(database_path, "SELECT name FROM images ORDER BY image_id")]
+
+
+def _is_whole(database_path: Path) -> bool:
+    """Whether the pages of a database are consistent; an empty file counts as one without tables."""
+    try:
+        return _query(database_path, "PRAGMA quick_check(1)") == [("ok",)]
+    except OutputError:
+        return False
 
 
 def _num_verified(database_path: Path) -> int:

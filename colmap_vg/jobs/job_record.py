@@ -73,7 +73,7 @@ def recorded_job(
         )
         before = _read(path) if resume else {}
         models = existing_models(output_path)
-        if models and before == {**job, "finished": True} and (output_path / SUMMARY_NAME).exists():
+        if models and before == {**job, "finished": True, "files": _sizes(output_path)}:
             yield JobState(finished=True, overwrite=False)
             return
         interrupted = before.get("finished") is False
@@ -85,7 +85,14 @@ def recorded_job(
             if not existing_models(output_path):
                 path.unlink(missing_ok=True)
             raise
-        atomic_write(path, json.dumps({**job, "finished": True}, indent=1))
+        atomic_write(path, json.dumps({**job, "finished": True, "files": _sizes(output_path)}, indent=1))
+
+
+def _sizes(output_path: Path) -> dict[str, int]:
+    """Sizes of the summary and of the models' files, bytes: models that were cut short or changed are not finished."""
+    models = [model for model in existing_models(output_path) if model != output_path]
+    files = [output_path / SUMMARY_NAME, *(file for model in models for file in sorted(model.iterdir()))]
+    return {file.relative_to(output_path).as_posix(): file.stat().st_size for file in files if file.is_file()}
 
 
 def _inputs(inputs: object) -> object:

@@ -38,6 +38,9 @@ def test_a_model_file_cut_short_is_replaced(tmp_path: Path, name: str, share: fl
     whole = {path.name: path.stat().st_size for path in (output / "0").iterdir()}
     for flag in ("--overwrite", "--resume"):
         cut(output / "0" / name, share)
+        finished = job(*arguments, "--resume")  # it was, but is not whole any more
+        assert finished.returncode == 1
+        assert "replace it with --overwrite" in finished.stderr
         if flag == "--resume":
             as_if_killed(output)
         else:
@@ -66,4 +69,20 @@ def test_a_database_cut_short_is_named_and_made_anew_on_request(tmp_path: Path, 
     assert line.endswith("run again without --resume")
     done = job(*arguments, "--overwrite")
     assert done.returncode == 0, done.stderr
+    assert pycolmap.Reconstruction(output / "0").num_reg_images() == 4
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
+def test_an_unfinished_database_cut_short_is_made_anew_by_resume(tmp_path: Path, share: float) -> None:
+    render_corner(4).write(tmp_path / "images")
+    output = tmp_path / "out"
+    arguments = ["run", "--image_path", tmp_path / "images", "--output_path", output, *SMALL]
+    assert job(*arguments).returncode == 0
+    as_if_killed(output)
+    unfinished = output / ".work" / "database.db"
+    (output / "database.db").rename(unfinished)
+    cut(unfinished, share)
+    done = job(*arguments, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert ("is damaged: features are extracted again" in done.stdout) == (share > 0.0)
     assert pycolmap.Reconstruction(output / "0").num_reg_images() == 4
