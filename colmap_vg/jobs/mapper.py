@@ -17,7 +17,7 @@ from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cameras
 from colmap_vg.errors import MappingError
 from colmap_vg.events import StageEvent, StageLog
-from colmap_vg.geometry.similarity import align_positions
+from colmap_vg.jobs.finished_solution import solution_of_models
 from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.mapping.build import (
     CONVERGED_COST_RATIO,
@@ -33,11 +33,9 @@ from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, po
 from colmap_vg.mapping.weak_cuts import WeakCut, cut_along, weak_cuts
 from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.reading.read import read_with_caveats
-from colmap_vg.scene.edge_residuals import graph_residual_sigmas
 from colmap_vg.scene.solution import PoseSolution
-from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict
+from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.scene.view_graph import ViewGraph
-from colmap_vg.solver.agreement import pair_agreement
 from colmap_vg.solver.solve import solve_view_graph
 from colmap_vg.solver.state import described
 
@@ -165,7 +163,10 @@ def map_database(
             published = publish_models(staged, output_path)
             log.result(", ".join(map(str, published)))
     models = {index: model.reconstruction for index, model in enumerate(built)}
-    return MappingResult(models, graph, _as_in_models(solution, graph, built, cuts), cuts)
+    finished = solution_of_models(
+        solution, graph, [model.reconstruction for model in built], [model.result for model in built], cuts
+    )
+    return MappingResult(models, graph, finished, cuts)
 
 
 @dataclass(frozen=True)
@@ -426,77 +427,3 @@ def _weak_cuts(
                     )
         log.result(f"{sum(map(len, found))} weak links within models")
     return found
-
-
-def _as_in_models(
-    solution: PoseSolution, graph: ViewGraph, models: Sequence[_Model], cuts: Sequence[Sequence[WeakCut]]
-) -> PoseSolution:
-    """Update a solution with the poses, focal lengths and image verdicts of the finished models."""
-    words = solution.image_verdicts.astype(object)
-    words[solution.component >= 0] = ImageVerdict.FEW_OBSERVATIONS
-    misplaced = sorted(set().union(*(model.result.misplaced for model in models)))
-    words[np.isin(solution.image_ids, misplaced)] = ImageVerdict.MISPLACED
-    component = np.full(len(words), -1)
-    rotations = np.full_like(solution.cam_from_world_rotations, np.nan)
-    centers = np.full_like(solution.projection_centers, np.nan)
-    focal_scales = solution.focal_scales.copy()
-    for index in reversed(range(len(models))):
-        model = models[index].reconstruction
-        for row in np.flatnonzero(np.isin(solution.image_ids, sorted(model.reg_image_ids()))):
-            image = model.image(int(solution.image_ids[row]))
-            component[row] = index
-            words[row] = ImageVerdict.REGISTERED if index == 0 else ImageVerdict.OTHER_MODEL
-            rotations[row] = image.cam_from_world().rotation.matrix()
-            centers[row] = image.projection_center()
-        focal_scales = _focal_scales(focal_scales, graph, model)
-    agreement = pair_agreement(graph, rotations, centers, component)
-    contradicted = sorted(set().union(*(cut.images for of_model in cuts for cut in of_model if cut.contradicted)))
-    in_doubt = solution.in_doubt
-    if contradicted:
-        in_doubt = (False if in_doubt is None else in_doubt) | np.isin(solution.image_ids, contradicted)
-    doubtful = in_doubt is not None or any(model.result.folded for model in models)
-    status, message = described(words, solution.converged, agreement, doubtful)
-    return replace(
-        solution,
-        position_covariances=_covariances_in_models(solution, centers, component),
-        cam_from_world_rotations=rotations,
-        projection_centers=centers,
-        registered=component == 0,
-        component=component,
-        focal_scales=focal_scales,
-        image_verdicts=words.astype(str),
-        status=status,
-        message=message,
-        edge_residual_sigmas=graph_residual_sigmas(graph, rotations, centers, component),
-        agreement=agreement,
-        in_doubt=in_doubt,
-    )
-
-
-def _covariances_in_models(
-    solution: PoseSolution, centers: NDArray[np.float64], component: NDArray[np.int64]
-) -> NDArray[np.float64] | None:
-    """Position covariances in the frames of the models (n, 3, 3); NaN for images that were registered by points."""
-    if solution.position_covariances is None:
-        return None
-    covariances = np.full_like(solution.position_covariances, np.nan)
-    for model in range(int(component.max(initial=-1)) + 1):
-        rows = np.flatnonzero((component == model) & np.isfinite(solution.projection_centers).all(axis=1))
-        if len(rows) >= 3:
-            _, similarity = align_positions(solution.projection_centers[rows], centers[rows])
-            turned = similarity.rotation @ solution.position_covariances[rows] @ similarity.rotation.T
-            covariances[rows] = similarity.scale**2 * turned
-    return covariances
-
-
-def _focal_scales(
-    scales: NDArray[np.float64], graph: ViewGraph, model: "pycolmap.Reconstruction"
-) -> NDArray[np.float64]:
-    """Update the factors on the graph's focal lengths of the cameras that a model uses."""
-    scales = scales.copy()
-    if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
-        used = {model.image(i).camera_id for i in model.reg_image_ids()}
-        for row, camera_id in enumerate(graph.camera_ids.tolist()):
-            if camera_id in used:
-                scales[row] = model.camera(camera_id).mean_focal_length() / graph.camera_focal_lengths[row]
-    return scales

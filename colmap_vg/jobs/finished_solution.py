@@ -1,0 +1,114 @@
+"""The solution of a job as its finished models have it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.geometry.similarity import align_positions
+from colmap_vg.mapping.build import BuildResult
+from colmap_vg.mapping.weak_cuts import WeakCut
+from colmap_vg.scene.edge_residuals import graph_residual_sigmas
+from colmap_vg.scene.solution import PoseSolution
+from colmap_vg.scene.verdicts import ImageVerdict
+from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.solver.agreement import pair_agreement
+from colmap_vg.solver.state import described
+
+
+def solution_of_models(
+    solution: PoseSolution,
+    graph: ViewGraph,
+    models: "Sequence[pycolmap.Reconstruction]",
+    results: Sequence[BuildResult],
+    cuts: Sequence[Sequence[WeakCut]],
+) -> PoseSolution:
+    """Update a solution with the poses, focal lengths and image verdicts of the finished models.
+
+    Parameters
+    ----------
+    solution : PoseSolution
+        As solved, before triangulation and bundle adjustment.
+    graph : ViewGraph
+    models : sequence of pycolmap.Reconstruction
+        The largest first.
+    results : sequence of BuildResult
+        Of each model.
+    cuts : sequence of sequences of WeakCut
+        Weak cuts of each model; images of contradicted ones are in doubt.
+
+    Returns
+    -------
+    PoseSolution
+        Its residuals and agreement are those of the models; radial terms stay as solved.
+    """
+    words = solution.image_verdicts.astype(object)
+    words[solution.component >= 0] = ImageVerdict.FEW_OBSERVATIONS
+    misplaced = sorted(set().union(*(result.misplaced for result in results)))
+    words[np.isin(solution.image_ids, misplaced)] = ImageVerdict.MISPLACED
+    component = np.full(len(words), -1)
+    rotations = np.full_like(solution.cam_from_world_rotations, np.nan)
+    centers = np.full_like(solution.projection_centers, np.nan)
+    focal_scales = solution.focal_scales.copy()
+    for index in reversed(range(len(models))):
+        model = models[index]
+        for row in np.flatnonzero(np.isin(solution.image_ids, sorted(model.reg_image_ids()))):
+            image = model.image(int(solution.image_ids[row]))
+            component[row] = index
+            words[row] = ImageVerdict.REGISTERED if index == 0 else ImageVerdict.OTHER_MODEL
+            rotations[row] = image.cam_from_world().rotation.matrix()
+            centers[row] = image.projection_center()
+        focal_scales = _focal_scales(focal_scales, graph, model)
+    agreement = pair_agreement(graph, rotations, centers, component)
+    contradicted = sorted(set().union(*(cut.images for of_model in cuts for cut in of_model if cut.contradicted)))
+    in_doubt = solution.in_doubt
+    if contradicted:
+        in_doubt = (False if in_doubt is None else in_doubt) | np.isin(solution.image_ids, contradicted)
+    doubtful = in_doubt is not None or any(result.folded for result in results)
+    status, message = described(words, solution.converged, agreement, doubtful)
+    return replace(
+        solution,
+        position_covariances=_covariances_in_models(solution, centers, component),
+        cam_from_world_rotations=rotations,
+        projection_centers=centers,
+        registered=component == 0,
+        component=component,
+        focal_scales=focal_scales,
+        image_verdicts=words.astype(str),
+        status=status,
+        message=message,
+        edge_residual_sigmas=graph_residual_sigmas(graph, rotations, centers, component),
+        agreement=agreement,
+        in_doubt=in_doubt,
+    )
+
+
+def _covariances_in_models(
+    solution: PoseSolution, centers: NDArray[np.float64], component: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
+    """Position covariances in the frames of the models (n, 3, 3); NaN for images that were registered by points."""
+    if solution.position_covariances is None:
+        return None
+    covariances = np.full_like(solution.position_covariances, np.nan)
+    for model in range(int(component.max(initial=-1)) + 1):
+        rows = np.flatnonzero((component == model) & np.isfinite(solution.projection_centers).all(axis=1))
+        if len(rows) >= 3:
+            _, similarity = align_positions(solution.projection_centers[rows], centers[rows])
+            turned = similarity.rotation @ solution.position_covariances[rows] @ similarity.rotation.T
+            covariances[rows] = similarity.scale**2 * turned
+    return covariances
+
+
+def _focal_scales(
+    scales: NDArray[np.float64], graph: ViewGraph, model: "pycolmap.Reconstruction"
+) -> NDArray[np.float64]:
+    """Update the factors on the graph's focal lengths of the cameras that a model uses."""
+    scales = scales.copy()
+    if graph.camera_ids is not None and graph.camera_focal_lengths is not None:
+        used = {model.image(i).camera_id for i in model.reg_image_ids()}
+        for row, camera_id in enumerate(graph.camera_ids.tolist()):
+            if camera_id in used:
+                scales[row] = model.camera(camera_id).mean_focal_length() / graph.camera_focal_lengths[row]
+    return scales
