@@ -1,6 +1,5 @@
 """Render a folder of photographs, and keep their true cameras."""
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from colmap_vg.demo.exif import with_focal_length
 from colmap_vg.demo.render import RayCaster, photograph, pixel_rays
 from colmap_vg.demo.scene import build_ruin
 from colmap_vg.demo.texture import paint
+from colmap_vg.linear.threads import num_workers
 from colmap_vg.simulation.ring_scenes import look_at
 
 Array = NDArray[np.float64]
@@ -107,7 +107,7 @@ def render_photographs(
         _, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 93])
         return with_focal_length(jpeg.tobytes(), "colmap_vg", "demo", _FOCAL_35MM / 5.6, round(_FOCAL_35MM))
 
-    with ThreadPoolExecutor(num_threads if num_threads > 0 else os.cpu_count()) as pool:
+    with ThreadPoolExecutor(num_workers(num_threads)) as pool:
         for k, file in enumerate(pool.map(render, range(num_images))):
             (image_path / cameras.names[k]).write_bytes(file)
             if on_image is not None:

@@ -27,6 +27,7 @@ from colmap_vg.features.photographs import (
 )
 from colmap_vg.features.sift_extraction import extract_sift
 from colmap_vg.features.staging import readable_folder
+from colmap_vg.linear.threads import num_workers
 from colmap_vg.options import FeatureOptions
 
 UNREADABLE = "COLMAP cannot read it"
@@ -289,8 +290,7 @@ def _extract_by_colmap(
     extraction.max_image_size = options.max_image_size
     extraction.sift.max_num_features = options.max_num_features
     camera_mode, reader_options = _camera_mode(options), _reader_options(options)
-    threads = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
-    step = IMAGES_PER_CALL * threads
+    step = IMAGES_PER_CALL * num_workers(options.num_threads)
     for start in range(0, len(names), step):
         log.progress(f"{start} of {len(names)} photographs", start / len(names), start)
         part = names[start : start + step]

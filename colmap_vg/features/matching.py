@@ -1,6 +1,5 @@
 """Match and verify a database's features: all pairs of images, or some."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
@@ -21,7 +20,7 @@ from colmap_vg.features.pair_matching import (
 )
 from colmap_vg.features.pair_selection import strongest
 from colmap_vg.features.pairings import SELECTION_SHARE, selected_pairs, sequential_pairs, spatial_pairs
-from colmap_vg.linear.threads import single_threaded_blas
+from colmap_vg.linear.threads import num_workers, single_threaded_blas
 from colmap_vg.options import FeatureOptions
 from colmap_vg.scene.components import components_by_size
 
@@ -80,7 +79,7 @@ def _match(database_path: str | PathLike[str], options: FeatureOptions, log: Sta
     if options.matching == "auto" and len(names) <= MAX_ALL_PAIRS:
         match_pairs(database_path, list(combinations(names, 2)), options, log)
         return ""
-    threads = _num_threads(options.num_threads)
+    threads = num_workers(options.num_threads)
     if options.matching == "spatial":
         pairs, apart = spatial_pairs(database_path, log)
         if apart:
@@ -135,7 +134,7 @@ class _Matcher:
 
     def __init__(self, database: pycolmap.Database, options: FeatureOptions) -> None:
         self._database, self._verification = database, _verification(options)
-        self._workers = _num_threads(options.num_threads)
+        self._workers = num_workers(options.num_threads)
         images = database.read_all_images()
         self.image_ids = {image.name: image.image_id for image in images}
         self._cameras = {image.image_id: database.read_camera(image.camera_id) for image in images}
@@ -198,7 +197,3 @@ def _matched(
     how: PairMatcher, verification: pycolmap.TwoViewGeometryOptions, images: tuple[ImageFeatures, ImageFeatures]
 ) -> PairMatches:
     return how(*images, verification)
-
-
-def _num_threads(num_threads: int) -> int:
-    return num_threads if num_threads > 0 else os.cpu_count() or 1

@@ -188,6 +188,11 @@ class _Nearest:
 
 
 def _passes(nearest: Products, second: Products, max_ratio: float) -> NDArray[np.bool_]:
-    """Ratio and distance test on products; squared distances of unit vectors are 2 - 2 cos."""
-    first_squared, second_squared = (2.0 - 2.0 * product / _SQUARED_NORM for product in (nearest, second))
+    """Ratio and distance test on products; squared distances of unit vectors are 2 - 2 cos.
+
+    Norms are a little more or less than 512: equal descriptors are at distance 0, and none of two is nearer.
+    """
+    first_squared, second_squared = (
+        np.maximum(2.0 - 2.0 * product / _SQUARED_NORM, 0.0) for product in (nearest, second)
+    )
     return np.asarray((first_squared < max_ratio**2 * second_squared) & (first_squared <= MAX_SQUARED_DISTANCE))

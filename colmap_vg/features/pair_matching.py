@@ -1,4 +1,4 @@
-"""Match two images: their largest features first, and along epipolar lines what is left.
+"""Match two images: their largest features first, then the others where the geometry of these predicts them.
 
 Features of the largest scales are few and the most repeatable. They are matched by brute force, and where they verify
 an epipolar geometry, all features are matched near its lines: of 8,192 features a twentieth of the products. In pairs
@@ -13,22 +13,24 @@ from numpy.typing import NDArray
 
 from colmap_vg.features.nearest_descriptors import epipolar_matches, homography_matches, mutual_matches
 from colmap_vg.features.orientation_votes import excess_over_chance, log2_scales, num_agreeing, orientations
+from colmap_vg.two_view.sampson_errors import pixel_sampson_errors
 
 MAX_FIRST_FEATURES = 2048
 """Features of each image that are matched first, those of largest scale."""
 MIN_CONSISTENT = 10
-"""Matches that agree on a rotation and a change of scale, below which verification is not tried. It takes 15 inliers;
-perspective takes a third out of two by two bins at most."""
+"""Matches that agree on a rotation and a change of scale, below which pairs are not verified: a geometry needs 15
+inliers, of which perspective leaves a third outside the fullest two by two bins at most."""
 CONFIRMING_TRIALS = 20
 """RANSAC trials at least, in place of 100, for matches that one geometry has selected."""
 MIN_EPIPOLAR_ERROR_PX = 1.0
-"""Pixels from the epipolar line within which features are matched at least: a geometry from few matches is so exact."""
+"""Minimum distance from the epipolar line, pixels, within which features are matched: geometries are no more exact."""
 MAX_EPIPOLAR_ERROR_PX = 4.0
-"""The same at most: what RANSAC accepts as an inlier."""
+"""Maximum of that distance, pixels: RANSAC's threshold for inliers."""
 MAX_SHIFT = 0.06
-"""Share of the image's longer side within which features are matched about the place that a homography predicts."""
-_RESIDUALS_IN_BOUND = 4.5
-"""Median residuals of the first inliers in the bound on others: three standard deviations of normal errors."""
+"""Distance from the place that a homography predicts within which features are matched, share of the longer side."""
+_RESIDUALS_IN_BOUND = 6.3
+"""Median Sampson errors of the first inliers in the bound on the distance from a line: three standard deviations of a
+normal error that both images share."""
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -84,7 +86,7 @@ def match_pair(first: ImageFeatures, second: ImageFeatures, options: pycolmap.Tw
     Returns
     -------
     PairMatches
-        Its matches are those of the largest features, and those that were found near epipolar lines.
+        Matches of the largest features, and those found where their geometry predicts them.
     """
     of_largest = mutual_matches(first.descriptors[first.largest], second.descriptors[second.largest])
     matches = np.stack([first.largest[of_largest[:, 0]], second.largest[of_largest[:, 1]]], axis=1)
@@ -103,7 +105,7 @@ def match_pair(first: ImageFeatures, second: ImageFeatures, options: pycolmap.Tw
         return match_all_features(first, second, options)
     tried = np.isin(more[:, 0], first.largest) & np.isin(more[:, 1], second.largest)
     matches = _joined(matches, np.asarray(geometry.inlier_matches, dtype=np.int64), more[~tried])
-    found = _verified(first, second, matches, _confirming(options))
+    found = _verified(first, second, matches, options, CONFIRMING_TRIALS)
     if len(found.inlier_matches) < len(geometry.inlier_matches):
         return PairMatches(matches, geometry)
     return PairMatches(matches, found)
@@ -132,21 +134,20 @@ def num_consistent_matches(first: ImageFeatures, second: ImageFeatures, matches:
     return agreeing if excess_over_chance(np.array(agreeing), np.array(len(matches))) > 0.0 else 0
 
 
-def _confirming(options: pycolmap.TwoViewGeometryOptions) -> pycolmap.TwoViewGeometryOptions:
-    """Options for matches that one geometry has selected, nearly all of which are inliers."""
-    confirming = pycolmap.TwoViewGeometryOptions(**options.todict(recursive=False))
-    confirming.ransac.min_num_trials = CONFIRMING_TRIALS
-    return confirming
-
-
 def _verified(
-    first: ImageFeatures, second: ImageFeatures, matches: IntArray, options: pycolmap.TwoViewGeometryOptions
+    first: ImageFeatures,
+    second: ImageFeatures,
+    matches: IntArray,
+    options: pycolmap.TwoViewGeometryOptions,
+    min_num_trials: int | None = None,
 ) -> pycolmap.TwoViewGeometry:
-    """Verify matches; RANSAC need not find a share of inliers that makes less than the least number of them."""
+    """Verify matches; RANSAC does not search for a share of inliers that would be less than their minimum number."""
     if len(matches) < options.min_num_inliers:
         return pycolmap.TwoViewGeometry()
     options = pycolmap.TwoViewGeometryOptions(**options.todict(recursive=False))
     options.ransac.min_inlier_ratio = max(options.ransac.min_inlier_ratio, options.min_num_inliers / len(matches))
+    if min_num_trials is not None:
+        options.ransac.min_num_trials = min_num_trials
     return pycolmap.estimate_two_view_geometry(
         first.camera, first.points, second.camera, second.points, matches.astype(np.uint32), options
     )
@@ -170,8 +171,9 @@ def _near_lines(first: ImageFeatures, second: ImageFeatures, geometry: pycolmap.
         ]
         matrix, pixel = np.asarray(geometry.E), 1.0 / second.camera.mean_focal_length()
     seen = [np.flatnonzero(np.isfinite(at).all(axis=1)) for at in points]
-    errors = _distances(matrix, points[0][inliers[:, 0]], points[1][inliers[:, 1]])
-    bound = _RESIDUALS_IN_BOUND * float(np.nanmedian(errors)) if len(errors) else 0.0
+    offsets = np.array([0, len(inliers)])
+    errors = pixel_sampson_errors(matrix[None], offsets, points[0][inliers[:, 0]], points[1][inliers[:, 1]])
+    bound = _RESIDUALS_IN_BOUND * float(np.nanmedian(np.abs(errors)))
     bound = float(np.clip(bound, MIN_EPIPOLAR_ERROR_PX * pixel, MAX_EPIPOLAR_ERROR_PX * pixel))
     matches = epipolar_matches(
         matrix,
@@ -188,10 +190,3 @@ def _near_places(first: ImageFeatures, second: ImageFeatures, H: Array) -> IntAr
     """Matches near where a homography takes the features."""
     max_shift = MAX_SHIFT * max(second.camera.width, second.camera.height)
     return homography_matches(H, first.points, second.points, first.descriptors, second.descriptors, max_shift)
-
-
-def _distances(F: Array, points1: Array, points2: Array) -> Array:
-    """Distances (k,) of points of image 2 from the epipolar lines of their matches."""
-    lines = np.concatenate([points1, np.ones((len(points1), 1))], axis=1) @ np.asarray(F).T
-    off = np.sum(lines[:, :2] * points2, axis=1) + lines[:, 2]
-    return np.asarray(np.abs(off) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), np.finfo(float).tiny))

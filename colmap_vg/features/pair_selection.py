@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from colmap_vg.features.nearest_descriptors import mutual_matches
 from colmap_vg.features.orientation_votes import excess_over_chance, log2_scales, num_agreeing, orientations
+from colmap_vg.features.shortlist import shared_partners
 from colmap_vg.linear.threads import single_threaded_blas
 
 STRONGEST_SHARE = 8
@@ -152,10 +153,7 @@ def pair_scores(num_matches: CountArray, num_consistent: CountArray) -> NDArray[
         Scores, in matches; symmetric.
     """
     excess = excess_over_chance(num_consistent, num_matches)
-    degree = excess.sum(axis=0) + 1.0
-    linked = excess / np.sqrt(np.outer(degree, degree))
-    through_others = linked @ linked
-    np.fill_diagonal(through_others, 0.0)
+    through_others = shared_partners(excess)
     if through_others.any():
         excess = excess + through_others * (excess.sum() / through_others.sum())
     return np.asarray(np.round(excess, 6))  # so that the order does not depend on the last bit of a product

@@ -13,7 +13,6 @@ from colmap_vg.errors import ImageFolderError
 from colmap_vg.events import StageLog
 from colmap_vg.features.orientation_votes import excess_over_chance
 from colmap_vg.features.pair_selection import (
-    StrongestFeatures,
     num_strongest,
     preemptive_matches,
     select_pairs,
@@ -51,6 +50,10 @@ def selected_pairs(database_path: str | PathLike[str], num_threads: int, seed: i
     list of (str, str)
         Names of images.
     """
+
+    def progress(done: float) -> None:
+        log.progress("selecting pairs", SELECTION_SHARE * done)
+
     with pycolmap.Database.open(database_path) as database:
         images = sorted(database.read_all_images(), key=lambda image: _natural(image.name))
         most = num_strongest([database.num_keypoints_for_image(image.image_id) for image in images])
@@ -61,29 +64,15 @@ def selected_pairs(database_path: str | PathLike[str], num_threads: int, seed: i
             keypoints.append(own[rows])
             descriptors.append(database.read_descriptors(image.image_id).data[rows])
     features = strongest_features(keypoints, descriptors)
-    names, positions = [image.name for image in images], np.full((len(images), 3), np.nan)
-    located = _gps_positions(database_path)
-    positions[[names.index(name) for name in located]] = np.reshape([*located.values()], (-1, 3))
+    names, located = [image.name for image in images], _gps_positions(database_path)
+    positions = np.array([located.get(name, np.full(3, np.nan)) for name in names])
     candidates = shortlisted(features.descriptors, positions, seed)
-    counts = _preemptive_matches(features, candidates, num_threads, 0.5 * SELECTION_SHARE, 0.0, log)
-    more = partners_of_partners(excess_over_chance(*counts[::-1]), candidates, MORE_CANDIDATES)
+    num_matches, num_consistent = preemptive_matches(features, num_threads, progress, candidates)
+    more = partners_of_partners(excess_over_chance(num_consistent, num_matches), candidates, MORE_CANDIDATES)
     if more.any():
-        added = _preemptive_matches(features, more, num_threads, 0.5 * SELECTION_SHARE, 0.5 * SELECTION_SHARE, log)
-        counts = (counts[0] + added[0], counts[1] + added[1])
-    return [(names[first], names[second]) for first, second in select_pairs(*counts)]
-
-
-def _preemptive_matches(
-    features: StrongestFeatures,
-    candidates: NDArray[np.bool_],
-    num_threads: int,
-    share: float,
-    before: float,
-    log: StageLog,
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    return preemptive_matches(
-        features, num_threads, lambda done: log.progress("selecting pairs", before + share * done), candidates
-    )
+        added = preemptive_matches(features, num_threads, candidates=more)
+        num_matches, num_consistent = num_matches + added[0], num_consistent + added[1]
+    return [(names[first], names[second]) for first, second in select_pairs(num_matches, num_consistent)]
 
 
 def sequential_pairs(names: Sequence[str], overlap: int) -> list[tuple[str, str]]:

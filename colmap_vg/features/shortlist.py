@@ -35,14 +35,14 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-def shortlisted(descriptors: NDArray[np.uint8], positions: NDArray[np.float64] | None, seed: int) -> BoolArray:
+def shortlisted(descriptors: NDArray[np.uint8], positions: NDArray[np.float64], seed: int) -> BoolArray:
     """Pairs of images that may overlap.
 
     Parameters
     ----------
     descriptors : (n, h, d) uint8 array
         Of the strongest features of each image, in the natural order of their names; rows of zeros do not count.
-    positions : (n, 3) array or None
+    positions : (n, 3) array
         Metres; NaN where unknown.
     seed : int
         Of the words.
@@ -62,8 +62,8 @@ def shortlisted(descriptors: NDArray[np.uint8], positions: NDArray[np.float64] |
     _mark(near, np.argsort(-similarity, axis=1, kind="stable")[:, :SIMILAR_IMAGES])
     for step in range(1, SEQUENCE_NEIGHBORS + 1):
         near[np.arange(n - step), np.arange(step, n)] = True
-    known = np.flatnonzero(np.isfinite(positions).all(axis=1)) if positions is not None else np.empty(0, np.int64)
-    if positions is not None and len(known) > 1:
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    if len(known) > 1:
         neighbors = min(GPS_NEIGHBORS + 1, len(known))
         found = cKDTree(positions[known]).query(positions[known], neighbors)[1]
         near[np.repeat(known, neighbors), known[found].ravel()] = True
@@ -87,15 +87,21 @@ def partners_of_partners(scores: Array, tried: BoolArray, most: int) -> BoolArra
     (n, n) bool array
         Symmetric.
     """
-    degree = scores.sum(axis=0) + 1.0
-    linked = scores / np.sqrt(np.outer(degree, degree))
-    shared = np.where(tried, 0.0, np.round(linked @ linked, 9))
-    np.fill_diagonal(shared, 0.0)
+    shared = np.where(tried, 0.0, np.round(shared_partners(scores), 9))
     best = np.argsort(-shared, axis=1, kind="stable")[:, :most]
     chosen = np.zeros_like(tried)
     _mark(chosen, best)
     chosen &= shared > 0.0
     return np.asarray(chosen | chosen.T)
+
+
+def shared_partners(scores: Array) -> Array:
+    """Sums (n, n) over third images of the products of both pairs' scores, normalised by the images' total scores."""
+    degree = scores.sum(axis=0) + 1.0
+    linked = scores / np.sqrt(np.outer(degree, degree))
+    shared = linked @ linked
+    np.fill_diagonal(shared, 0.0)
+    return np.asarray(shared)
 
 
 @single_threaded_blas

@@ -1,6 +1,5 @@
 """Put OpenCV's SIFT features of photographs into a database, on all cores."""
 
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.events import StageLog
 from colmap_vg.features.sift import Features, sift_features
+from colmap_vg.linear.threads import num_workers
 from colmap_vg.options import FeatureOptions
 
 DEFAULT_MAX_IMAGE_SIZE = 3200
@@ -47,7 +47,7 @@ def extract_sift(
     ImageFolderError
         An image can no longer be read.
     """
-    workers = options.num_threads if options.num_threads > 0 else os.cpu_count() or 1
+    workers = num_workers(options.num_threads)
     with (
         pycolmap.Database.open(database_path) as database,
         _one_thread_per_image(),

@@ -1,9 +1,10 @@
-"""Restriction of BLAS to one thread, for reproducible results and speed.
+"""Number of threads of a job, and restriction of BLAS to one, for reproducible results and speed.
 
 The matrices of viewing graphs are small: BLAS threads gain little on them and, on busy cores, wait for each other at
 every call (a Cholesky factorisation of 600 unknowns took up to 1.4 s with several threads, 6 ms with one).
 """
 
+import os
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar
@@ -12,6 +13,11 @@ from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+def num_workers(num_threads: int) -> int:
+    """Number of worker threads for an option `num_threads`, in which -1 stands for all cores."""
+    return num_threads if num_threads > 0 else os.cpu_count() or 1
 
 
 @cache

@@ -48,3 +48,19 @@ def test_a_killed_process_is_an_error_that_names_memory_and_leaves_a_job_to_resu
     assert make_database(images, tmp_path, OPTIONS, log, resume=True).num_verified_pairs > 0
     assert not log.warnings
     assert (tmp_path / "database.db").stat().st_ino == unfinished
+
+
+def test_a_process_killed_before_it_reads_its_task_is_the_same_error(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = subprocess.Popen
+
+    def killed(*arguments: Any, **options: Any) -> "subprocess.Popen[bytes]":
+        process = start(*arguments, **options)
+        process.kill()
+        process.wait()
+        return process
+
+    monkeypatch.setattr("colmap_vg.features.isolated.subprocess.Popen", killed)
+    with pytest.raises(ImageFolderError, match="killed, most likely because memory ran out"):
+        make_database(images, tmp_path, OPTIONS)

@@ -27,12 +27,14 @@ def disturbed(rng: np.random.Generator, original: np.ndarray, size: int) -> np.n
 def by_brute_force(first: np.ndarray, second: np.ndarray, allowed: np.ndarray, ratio: float, both_ways: bool) -> set:
     squared = 2.0 - 2.0 * (first.astype(int) @ second.astype(int).T) / 512.0**2
     squared[~allowed] = 2.0
+    distances = np.maximum(squared, 0.0)
     found = set()
     for i, row in enumerate(squared):
         j = int(row.argmin())
-        column = squared[:, j]
-        good = column.argmin() == i and row[j] < ratio**2 * np.sort(row)[1] and row[j] <= MAX_SQUARED_DISTANCE
-        if good and (not both_ways or column[i] < ratio**2 * np.sort(column)[1]):
+        near = distances[i, j]
+        good = squared[:, j].argmin() == i and near < ratio**2 * np.sort(distances[i])[1]
+        good &= near <= MAX_SQUARED_DISTANCE
+        if good and (not both_ways or near < ratio**2 * np.sort(distances[:, j])[1]):
             found.add((i, j))
     return found
 
@@ -101,6 +103,14 @@ def test_homography_matches_are_those_of_brute_force_near_predicted_places() -> 
     found = {tuple(row) for row in homography_matches(-2.0 * H, points1, points2, first, second, 50.0).tolist()}
     assert found == expected
     assert len(found) > 100
+
+
+def test_copies_are_ambiguous_whatever_their_norm() -> None:
+    rng = np.random.default_rng(3)
+    first = descriptors(rng, 200)
+    first[:, 0] += 40  # of norms above 512
+    second = np.concatenate([first, first[:50]])
+    assert mutual_matches(first, second)[:, 0].tolist() == list(range(50, 200))
 
 
 def test_nothing_matches_nothing() -> None:

@@ -32,7 +32,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_small_folders_have_no_shortlist() -> None:
-    near = shortlisted(places(2, 3, 0), None, 0)
+    near = shortlisted(places(2, 3, 0), np.full((6, 3), np.nan), 0)
     np.testing.assert_array_equal(near, ~np.eye(6, dtype=bool))
 
 
@@ -40,7 +40,7 @@ def test_small_folders_have_no_shortlist() -> None:
 def test_views_of_one_place_are_on_each_others_list() -> None:
     descriptors = places(12, 5, 1)
     order = np.random.default_rng(2).permutation(60)
-    near = shortlisted(descriptors[order], None, 0)
+    near = shortlisted(descriptors[order], np.full((60, 3), np.nan), 0)
     place = order // 5
     same = (place[:, None] == place) & ~np.eye(60, dtype=bool)
     assert near[same].mean() > 0.95
@@ -60,7 +60,7 @@ def test_neighbours_by_position_are_on_the_list(monkeypatch: pytest.MonkeyPatch)
     positions[order] = np.arange(20)[:, None] * [10.0, 0.0, 0.0]
     near = shortlisted(descriptors, positions, 0)
     assert near[order[:-1], order[1:]].all()
-    without = shortlisted(descriptors, None, 0)
+    without = shortlisted(descriptors, np.full((30, 3), np.nan), 0)
     assert not without[order[:-1], order[1:]].all()
 
 

@@ -7,12 +7,13 @@ import numpy as np
 import pycolmap
 import pytest
 from linked_scenes import alike_streets, near, projection_centers, street, survey, write_scene
+from synthetic_databases import look_at
 
 from colmap_vg import MappingOptions, SolutionStatus
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.bridges import all_bridges
 from colmap_vg.jobs.mapper import MappingResult, map_database
-from colmap_vg.mapping.weak_cuts import WeakCut, _normals
+from colmap_vg.mapping.weak_cuts import WeakCut, _expected, _normals
 
 NUM = 10
 
@@ -102,3 +103,29 @@ def test_normals_are_those_of_walls_and_none_of_clouds() -> None:
         assert flat.mean() > 0.95
         assert np.abs(normals[flat, axis]).min() > 0.98
     assert _normals(reconstruction, cloud[:200])[1].mean() < 0.1
+
+
+def test_walls_are_expected_only_where_they_look_alike() -> None:
+    """Three images see a wall at 60 degrees; one at 52 should see it, too, and one at 72 sees it far more slanted."""
+    rng = np.random.default_rng(1)
+    wall = np.stack([rng.uniform(-0.5, 0.5, 300), rng.normal(0, 0.002, 300), rng.uniform(-0.5, 0.5, 300)], axis=1)
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="PINHOLE", width=800, height=800, params=[800.0, 800.0, 400.0, 400.0])
+    camera.camera_id = 1
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for number, degrees in enumerate((59.5, 60.0, 60.5, 52.0, 72.0), 1):
+        center = 6.0 * np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees)), 0.0])
+        image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
+        cam_from_world = look_at(center, np.zeros(3))
+        if number <= 3:
+            image.points2D = [pycolmap.Point2D(np.asarray(camera.img_from_cam(cam_from_world * xyz))) for xyz in wall]
+        reconstruction.add_image_with_trivial_frame(image, cam_from_world)
+    for row, xyz in enumerate(wall):
+        track = pycolmap.Track()
+        for number in (1, 2, 3):
+            track.add_element(number, row)
+        reconstruction.add_point3D(xyz, track)
+    every = np.array(list(combinations(range(1, 6), 2)), dtype=np.int64)
+    expected = _expected(reconstruction, np.arange(1, 6), every)
+    assert np.sum(expected.images == 3) > 500  # of 300 points beside three images
+    assert not np.any(expected.images == 4)
