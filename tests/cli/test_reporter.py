@@ -46,17 +46,17 @@ def test_verbose_shows_every_event(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_progress_has_a_rate_and_the_time_left(capsys: pytest.CaptureFixture[str]) -> None:
     with Reporter(verbose=True) as reporter:
-        for seconds, count in ((0.5, 0), (0.9, 2), (10.5, 20), (60.5, 120), (70.5, None)):
+        for seconds, count in ((0.5, 800), (0.9, 802), (10.5, 820), (60.5, 920), (70.5, None)):
             share = None if count is None else count / 8000
             reporter.on_event(StageEvent("matching", "progress", "of 8000 pairs", share, seconds, count))
         reporter.on_event(StageEvent("write", "started"))
         reporter.on_event(StageEvent("write", "progress", "models", 0.5, 5.0))
         reporter.on_event(StageEvent("write", "progress", "models", 0.75, 30.0))
     assert capsys.readouterr().out.splitlines() == [
-        "matching: of 8000 pairs (0 %)",
-        "matching: of 8000 pairs (0 %)",
-        "matching: of 8000 pairs (0 %, 2.0/s, 1 h 6 min left)",
-        "matching: of 8000 pairs (2 %, 2.0/s, 1 h 5 min left)",
+        "matching: of 8000 pairs (10 %)",
+        "matching: of 8000 pairs (10 %)",
+        "matching: of 8000 pairs (10 %, 2.0/s, 59 min 50 s left)",
+        "matching: of 8000 pairs (12 %, 2.0/s, 59 min 0 s left)",
         "matching: of 8000 pairs",
         "write: started",
         "write: models (50 %)",

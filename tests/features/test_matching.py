@@ -17,7 +17,7 @@ from colmap_vg.events import StageLog
 from colmap_vg.features import matching, pair_matching, pairings
 from colmap_vg.features.extraction import extract_and_match
 from colmap_vg.features.matching import match_features, match_pairs
-from colmap_vg.features.pair_selection import select_pairs
+from colmap_vg.features.pair_selection import preemptive_matches, select_pairs
 from colmap_vg.features.pairings import selected_pairs, sequential_pairs
 from colmap_vg.options import FeatureOptions
 
@@ -151,6 +151,39 @@ def test_a_photograph_of_something_else_costs_few_pairs(tmp_path: Path, corner: 
     noisy = [pair for pair in pairs if any(name.startswith("noise") for name in pair)]
     assert len(pairs) - len(noisy) >= 4
     assert len(noisy) <= 6  # of 22
+
+
+def test_shortlists_get_positions_and_are_extended_by_shared_partners(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extract_and_match(images, tmp_path / "a.db", QUICK)
+    with pycolmap.Database.open(tmp_path / "a.db") as database:
+        image = database.read_all_images()[0]
+        prior = pycolmap.PosePrior(position=np.array([4.0, 5.0, 6.0]))
+        prior.corr_data_id, prior.pose_prior_id = image.data_id, 1
+        database.write_pose_prior(prior)
+    chain, seen, tried = np.abs(np.subtract.outer(np.arange(4), np.arange(4))) == 1, [], []
+
+    def shortlisted(descriptors: np.ndarray, positions: np.ndarray, seed: int) -> np.ndarray:
+        seen.append(positions)
+        return chain
+
+    def matches(*arguments: object, candidates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        tried.append(arguments[3] if candidates is None else candidates)
+        return preemptive_matches(*arguments[:2], candidates=tried[-1])
+
+    monkeypatch.setattr(pairings, "shortlisted", shortlisted)
+    monkeypatch.setattr(pairings, "preemptive_matches", matches)
+    log = StageLog()
+    with log.stage("pairs"):
+        pairs = selected_pairs(tmp_path / "a.db", 1, 0, log)
+    ordered = sorted(NAMES, key=pairings._natural)
+    assert np.isfinite(seen[0]).all(axis=1).tolist() == [name == image.name for name in ordered]
+    assert seen[0][ordered.index(image.name)].tolist() == [4.0, 5.0, 6.0]
+    assert len(tried) == 2
+    assert tried[1][0, 2]
+    assert not (tried[1] & chain).any()
+    assert len(pairs) > 3
 
 
 def test_photographs_without_features_are_no_obstacle(tmp_path: Path, images: Path) -> None:

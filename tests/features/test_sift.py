@@ -85,6 +85,9 @@ def test_tiles_give_the_features_of_the_whole(grey: np.ndarray, monkeypatch: pyt
     assert len(np.unique(theirs)) > 0.9 * len(whole.keypoints)
     cosines = np.sum(tiled.descriptors[mine].astype(float) * whole.descriptors[theirs], axis=1) / 512.0**2
     assert np.quantile(cosines, 0.2) > 0.97
+    fine = log2_scales(whole.keypoints[theirs]) < 1.2  # those of the tiles, wherever they are cut
+    assert fine.sum() == pytest.approx(np.sum(log2_scales(whole.keypoints) < 1.2), abs=5)
+    assert cosines[fine].min() > 0.99
 
 
 def test_no_feature_lies_where_the_mask_is_black(grey: np.ndarray) -> None:
