@@ -74,7 +74,11 @@ class FeatureFlags:
     """Flags of `FeatureOptions`."""
 
     features: Annotated[
-        Extractor, typer.Option("--features", help="Whose SIFT features are extracted; both match with one another.")
+        Extractor,
+        typer.Option(
+            "--features",
+            help="SIFT of OpenCV or of COLMAP, which takes four times as long. Their features match each other.",
+        ),
     ] = FeatureOptions.features
     camera_model: Annotated[
         str, typer.Option("--camera_model", help="COLMAP camera model of new cameras, such as PINHOLE or OPENCV.")

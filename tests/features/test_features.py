@@ -14,7 +14,7 @@ from colmap_vg.events import StageLog
 from colmap_vg.features.extraction import extract_and_match, extract_features, read_image_list
 from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import Photograph, find_photographs, split_odd_sizes
-from colmap_vg.features.sift_extraction import extract_sift
+from colmap_vg.features.sift_extraction import extract_sift, image_features
 from colmap_vg.options import FeatureOptions
 
 QUICK = {"num_threads": 2, "max_num_features": 500, "max_image_size": 240}
@@ -133,6 +133,17 @@ def test_features_of_opencv_and_colmap_match(tmp_path: Path, corner: Corner) -> 
         ids = {image.name: image.image_id for image in database.read_all_images()}
         mixed = [database.read_two_view_geometry(ids[names[1]], ids[name]) for name in (names[0], names[2])]
     assert all(len(geometry.inlier_matches) >= 100 for geometry in mixed)
+
+
+def test_formats_that_opencv_cannot_read_are_read_by_colmap(tmp_path: Path, corner: Corner) -> None:
+    grey = np.ascontiguousarray(corner.images[0][..., 1])
+    cv2.imwrite(str(tmp_path / "a.png"), grey)
+    assert pycolmap.Bitmap.from_array(grey).write(str(tmp_path / "a.tga"))
+    assert cv2.imread(str(tmp_path / "a.tga")) is None
+    png, tga = (image_features(tmp_path, name, FeatureOptions()) for name in ("a.png", "a.tga"))
+    np.testing.assert_array_equal(png.keypoints, tga.keypoints)
+    with pytest.raises(ImageFolderError, match="can no longer be read"):
+        image_features(tmp_path, "b.png", FeatureOptions())
 
 
 def test_database_is_pycolmaps_own_and_numbered_by_name(tmp_path: Path, corner: Corner) -> None:
