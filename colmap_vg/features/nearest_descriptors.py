@@ -18,9 +18,9 @@ MAX_WINDOW_RATIO = 0.7
 _SQUARED_NORM = np.float32(512.0**2)
 _BLOCK_ROWS = 256
 """Descriptors whose products with those of another image are held at once; 8 MB with 8,192 of them."""
-_NUM_BUNDLES = 24
+_NUM_BUNDLES = 32
 """Bundles of epipolar lines whose features are compared at once: fewer compare more features in vain, and more spend
-their time in calls (0.02 s a pair of 8,192 features at 16 to 48)."""
+their time in calls (0.01 s a pair of 7,000 features at 24 to 48)."""
 
 _CELLS = 8
 """Columns, and rows in each, of the cells of features that are compared with a window at once."""
@@ -107,10 +107,11 @@ def epipolar_matches(
         if not len(rows):
             continue
         low, high = of_lines[rows[0]], of_lines[rows[-1]]
-        away = np.abs((of_points - 0.5 * (low + high) + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
-        near = np.flatnonzero(away <= 0.5 * (high - low) + reach)
+        away = of_points - 0.5 * (low + high)
+        away -= np.pi * np.rint(away / np.pi)
+        near = np.flatnonzero(np.abs(away) <= 0.5 * (high - low) + reach)
         products = descriptors1[rows].astype(np.float32) @ descriptors2[near].astype(np.float32).T
-        np.copyto(products, 0.0, where=np.abs(lines32[rows] @ x32[near].T) > max_error)
+        products *= np.abs(lines32[rows] @ x32[near].T) <= max_error  # faster than assignments by a mask
         best.compare(rows, near, products)
     return best.matches(MAX_EPIPOLAR_RATIO)
 
@@ -150,7 +151,7 @@ def homography_matches(
             products = descriptors1[rows].astype(np.float32) @ descriptors2[near].astype(np.float32).T
             shift = np.abs(predicted32[rows, 0, None] - x2[near])
             np.maximum(shift, np.abs(predicted32[rows, 1, None] - y2[near]), out=shift)
-            np.copyto(products, 0.0, where=shift > max_shift)
+            products *= shift <= max_shift
             best.compare(rows, near, products)
     return best.matches(MAX_WINDOW_RATIO)
 

@@ -26,7 +26,7 @@ MAX_DISTANCE = 100.0
 """Metres between the GPS positions of photographs that spatial matching pairs."""
 MAX_SPATIAL_NEIGHBORS = 50
 """Photographs with which spatial matching pairs each, the nearest ones; as in COLMAP."""
-MORE_CANDIDATES = 20
+MORE_CANDIDATES = 50
 """Images with which each is first matched after the shortlist, for the partners that they share."""
 SELECTION_SHARE = 0.05
 """Share of the time of matching that selecting pairs takes, for the progress."""

@@ -125,7 +125,7 @@ def test_pairs_of_a_street_are_its_overlaps_and_few_others() -> None:
     chosen = {(int(first), int(second)) for first, second in select_pairs(*counts, min_partners=2)}
     overlaps = {(i, j) for i in range(30) for j in range(i + 1, min(i + 4, 30))}
     assert overlaps <= chosen
-    assert len(chosen - overlaps) <= 0.1 * 30 * 29 / 2
+    assert len(chosen - overlaps) <= 0.12 * 30 * 29 / 2
 
 
 @st.composite
