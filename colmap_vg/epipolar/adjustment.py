@@ -1,10 +1,10 @@
-"""Epipolar adjustment: refinement of all rotations, positions and free focal lengths by the epipolar errors of matches.
+"""Epipolar adjustment: refinement of all rotations, positions and free lenses by the epipolar errors of matches.
 
 No point is triangulated. The Cauchy cost of the Sampson errors (see :mod:`colmap_vg.two_view.sampson`) of all edges is
 minimised over the cameras, ``R <- exp(w) R`` (w in the camera's frame), ``p <- p + x``, by Levenberg's method on sparse
 blocks, together with that of the differences of depths in image triplets (see
-:mod:`colmap_vg.epipolar.depth_agreement`). The normal equations of each edge by its five or seven parameters are mapped
-to its cameras by the chain rule
+:mod:`colmap_vg.epipolar.depth_agreement`). The normal equations of each edge by its pose and lenses are mapped to its
+cameras by the chain rule
 
     w_ij = Q^T (R_ij^T w_j - w_i),   tau_ij = B^T (w_i x d) + B^T R_i (x_j - x_i) / |p_j - p_i|,   Q = [B, d].
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_equations, depth_residuals
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
-from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
@@ -38,7 +38,10 @@ _SHORTEST_BASELINE = 1e-6  # share of the RMS distance of cameras; keeps directi
 _EARLY_TOLERANCE = 300.0  # factor on the tolerance before the last stage, since the next scale changes the cameras more
 _MAX_TURN = 0.2  # radians per step
 _MAX_LOG_FOCAL_STEP = 0.3  # change of a log focal length per step
+_MAX_RADIAL_STEP = 0.1  # change of the radial term per step
 _MAX_LOG_FOCAL = np.log(3.0)  # beyond it a focal length has diverged; errors vanish with the focal length
+MAX_RADIAL_TERM = 0.6
+"""Largest absolute value of the radial term, at the focal lengths of the problem; beyond it the term has diverged."""
 _MIN_SIGMA_PX = 0.05  # pixels; below the noise of any keypoints, and keeps the scale of exact data finite
 
 
@@ -64,6 +67,8 @@ class AdjustmentResult:
         The last Cauchy scale, pixels.
     log : tuple of LogEntry
         One entry per iteration.
+    radial_term : float
+        At the problem's focal lengths, dimensionless; 0 if the problem has no bent cameras.
     """
 
     cam_from_world_rotations: Array
@@ -75,18 +80,27 @@ class AdjustmentResult:
     converged: bool
     scale_px: float
     log: tuple[LogEntry, ...]
+    radial_term: float = 0.0
+
+    @property
+    def cameras(self) -> "Cameras":
+        """Poses and lenses."""
+        lenses = Lenses(np.log(self.focal_scales), self.radial_term)
+        return Cameras(self.cam_from_world_rotations, self.projection_centers, lenses)
 
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """cam_from_world rotations (n, 3, 3), centres (n, 3) and log focal factors (c,)."""
+    """cam_from_world rotations (n, 3, 3), centres (n, 3) and lenses."""
 
     rotations: Array
     centers: Array
-    log_scales: Array
+    lenses: Lenses
 
     def moved(self, step: Array, free: IntArray, reach: Array | None = None) -> "Cameras":
         """Cameras after a step (6 n + f,), w and x of each image, then the free log focals; with the gauge restored.
+
+        A last unknown, if there is one, is the radial term.
 
         The shift of each image is limited to its `reach` (n,), so that no camera jumps at the gain of the others.
         """
@@ -97,9 +111,11 @@ class Cameras:
                 np.linalg.norm(poses[:, 3:], axis=1) / reach, np.linalg.norm(poses[:, :3], axis=1) / _MAX_TURN
             )
             poses = poses / np.maximum(far, 1.0)[:, None]
-        log_scales = self.log_scales.copy()
-        log_scales[free] += np.clip(step[6 * n :], -_MAX_LOG_FOCAL_STEP, _MAX_LOG_FOCAL_STEP)
-        return Cameras(so3.exp(poses[:, :3]) @ self.rotations, gauged(self.centers + poses[:, 3:]), log_scales)
+        log_scales, (by_focal, by_term) = self.lenses.log_scales.copy(), np.split(step[6 * n :], [len(free)])
+        log_scales[free] += np.clip(by_focal, -_MAX_LOG_FOCAL_STEP, _MAX_LOG_FOCAL_STEP)
+        term = self.lenses.radial_term + float(np.clip(by_term, -_MAX_RADIAL_STEP, _MAX_RADIAL_STEP).sum())
+        moved = so3.exp(poses[:, :3]) @ self.rotations, gauged(self.centers + poses[:, 3:])
+        return Cameras(*moved, Lenses(log_scales, term))
 
     def reach(self, edges: IntArray) -> Array:
         """Half the distance from each image to its nearest neighbour in the graph, with a lower limit: (n,)."""
@@ -136,9 +152,10 @@ def adjust_epipolar(
     initial_centers: Array,
     directions: Array,
     *,
-    initial_focal_scales: Array | None = None,
+    initial_lenses: Lenses | None = None,
     scales_px: tuple[float, ...] = (8.0, 2.0),
     final_sigmas: float = 1.0,
+    near: bool = False,
     max_num_iterations: int = 50,
     tolerance: float = 1e-5,
 ) -> AdjustmentResult:
@@ -154,13 +171,15 @@ def adjust_epipolar(
     directions : (m, 3) array
         Camera 2's centre in camera 1's frame by the edge's own matches. The cost does not distinguish opposite
         directions, so after each scale edges more than a right angle from the solved direction are dropped.
-    initial_focal_scales : (c,) array, optional
-        Initial factors on the problem's focal lengths, default 1.
+    initial_lenses : Lenses, optional
+        Default: the problem's focal lengths, without distortion.
     scales_px : tuple of float
         Successive Cauchy scales, pixels.
     final_sigmas : float
         Last Cauchy scale, in robust standard deviations of the matches' errors, if that is below the previous one:
         false matches with errors of a pixel would bias a result that is accurate to a quarter of it. 0 omits it.
+    near : bool
+        The initial cameras are near the minimum, so that full Newton steps are safe from the start.
     max_num_iterations : int
         Maximum number of steps at each scale.
     tolerance : float
@@ -179,11 +198,11 @@ def adjust_epipolar(
         raise GraphError("epipolar adjustment: the edges have no matches")
     lost = np.zeros(len(problem.focal_lengths), dtype=bool)
     while True:
-        log_scales = np.zeros(len(lost)) if initial_focal_scales is None else np.log(initial_focal_scales)
-        log_scales[lost] = 0.0
-        start = Cameras(initial_rotations, gauged(initial_centers), log_scales)
+        lenses = Lenses(np.zeros(len(lost))) if initial_lenses is None else initial_lenses
+        lenses = replace(lenses, log_scales=np.where(lost, 0.0, lenses.log_scales))
+        start = Cameras(initial_rotations, gauged(initial_centers), lenses)
         restricted = replace(problem, free_focals=problem.free_focals & ~lost)
-        found = _in_stages(restricted, start, directions, scales_px, final_sigmas, max_num_iterations, tolerance)
+        found = _in_stages(restricted, start, directions, scales_px, final_sigmas, near, max_num_iterations, tolerance)
         diverged = np.abs(np.log(found.focal_scales)) > _MAX_LOG_FOCAL
         if not diverged.any():
             return replace(found, lost_focals=lost)
@@ -196,10 +215,11 @@ def _in_stages(
     directions: Array,
     scales_px: tuple[float, ...],
     final_sigmas: float,
+    near: bool,
     max_num_iterations: int,
     tolerance: float,
 ) -> AdjustmentResult:
-    """Minimise at successive scales; end early if a focal length diverges."""
+    """Minimise at successive scales; end early if a lens diverges."""
     reversed_edges, rows = np.zeros(len(problem.edges), dtype=bool), np.arange(len(problem.edges))
     log: list[LogEntry] = []
     scale, cost, converged = np.inf, np.inf, False
@@ -211,8 +231,9 @@ def _in_stages(
         else:
             scale = min(scale, max(final_sigmas * _sigma(problem, cameras), _MIN_SIGMA_PX))
         end = tolerance if last else _EARLY_TOLERANCE * tolerance
-        cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log, near=stage > 0)
-        if _focal_diverged(cameras):
+        close = near or stage > 0
+        cameras, cost, converged = _minimized(problem, cameras, scale, max_num_iterations, end, log, near=close)
+        if _lens_diverged(cameras):
             break
         away = np.einsum("ka,ka->k", cameras.relative(problem.edges)[1], directions[rows]) < 0.0
         if away.any() and not away.all():
@@ -223,13 +244,14 @@ def _in_stages(
     return AdjustmentResult(
         so3.project(cameras.rotations),
         cameras.centers,
-        np.exp(cameras.log_scales),
-        np.zeros(len(cameras.log_scales), dtype=bool),
+        np.exp(cameras.lenses.log_scales),
+        np.zeros(len(cameras.lenses.log_scales), dtype=bool),
         reversed_edges,
         cost,
         converged,
         scale,
         tuple(log),
+        cameras.lenses.radial_term,
     )
 
 
@@ -239,13 +261,13 @@ def edge_errors(problem: EpipolarProblem, found: AdjustmentResult) -> Array:
     The median Sampson error or, if larger, the median depth residual in the best of the edge's triplets: false matches
     along their epipolar lines, as on a façade with repeated structure, have large residuals in depth only.
     """
-    cameras = Cameras(found.cam_from_world_rotations, found.projection_centers, np.log(found.focal_scales))
+    cameras = found.cameras
     R, d, _ = cameras.relative(problem.edges)
-    errors = median_errors(problem.matches(cameras.log_scales), R, d)
+    errors = median_errors(problem.matches(cameras.lenses), R, d)
     triplets = problem.triplets
     if triplets is None:
         return errors
-    rays = problem.triplet_rays(triplets, cameras.log_scales)
+    rays = problem.triplet_rays(triplets, cameras.lenses)
     medians = segment_quantiles(triplets.offsets, np.abs(depth_residuals(rays, cameras.about_middle(triplets.images))))
     best = np.full(len(errors), np.inf)
     np.minimum.at(best, triplets.edges.ravel(), np.repeat(medians, 2))
@@ -255,11 +277,12 @@ def edge_errors(problem: EpipolarProblem, found: AdjustmentResult) -> Array:
 def _sigma(problem: EpipolarProblem, cameras: Cameras) -> float:
     """Robust standard deviation of all matches' Sampson errors, pixels."""
     R, d, _ = cameras.relative(problem.edges)
-    return MAD_TO_SIGMA * float(np.median(np.abs(residuals(problem.matches(cameras.log_scales), R, d))))
+    return MAD_TO_SIGMA * float(np.median(np.abs(residuals(problem.matches(cameras.lenses), R, d))))
 
 
-def _focal_diverged(cameras: Cameras) -> bool:
-    return bool(np.any(np.abs(cameras.log_scales) > _MAX_LOG_FOCAL))
+def _lens_diverged(cameras: Cameras) -> bool:
+    lenses = cameras.lenses
+    return bool(np.any(np.abs(lenses.log_scales) > _MAX_LOG_FOCAL)) or abs(lenses.radial_term) > MAX_RADIAL_TERM
 
 
 def gauged(centers: Array) -> Array:
@@ -278,32 +301,37 @@ def gauged(centers: Array) -> Array:
 
 
 def cost_and_gradient(problem: EpipolarProblem, cameras: Cameras, scale_px: float) -> tuple[float, Array]:
-    """Half the Cauchy cost, and its gradient (6 n + f,) in the parameters of `Cameras.moved`."""
+    """Half the Cauchy cost, and its gradient (6 n + u,) in the parameters of `Cameras.moved`."""
     terms = _terms(problem, cameras, scale_px)
-    return _total(terms) / 2.0, _system(problem).gradient(terms)
+    return _total(terms) / 2.0, normal_system(problem).gradient(terms)
 
 
-def _system(problem: EpipolarProblem) -> NormalSystem:
+def normal_system(problem: EpipolarProblem) -> NormalSystem:
+    """Normal equations of the poses and free lenses of a problem."""
     images = [problem.edges] if problem.triplets is None else [problem.edges, problem.triplets.images]
     free = np.flatnonzero(problem.free_focals)
-    return NormalSystem(problem.num_images, images, problem.camera_idx, free, len(problem.focal_lengths))
+    return NormalSystem(
+        problem.num_images,
+        images,
+        problem.camera_idx,
+        free,
+        len(problem.focal_lengths),
+        with_radial=problem.bent_cameras is not None and problem.lenses_are_free,
+    )
 
 
 def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float, *, near: bool = False) -> list[CameraTerms]:
     """Robust costs of edges and triplets with derivatives by the cameras; Newton Hessians of edges if `near`."""
-    edges, with_focals = problem.edges, bool(problem.free_focals.any())
-    R, d, length = cameras.relative(edges)
-    at = normal_equations(
-        problem.matches(cameras.log_scales), R, d, np.full(len(edges), scale), with_focals=with_focals
-    )
+    edges, (R, d, length) = problem.edges, cameras.relative(problem.edges)
+    at = normal_equations(problem.matches(cameras.lenses), R, d, np.full(len(edges), scale))
     chain = edge_chain(cameras.rotations[edges[:, 0]], R, d, length)
     hessians = at.newton_hessians if near else at.hessians
     terms = [CameraTerms.chained(edges, at.costs, at.gradients, hessians, chain)]
     if problem.triplets is not None:
         images = problem.triplets.images
-        rays = problem.triplet_rays(problem.triplets, cameras.log_scales)
+        rays = problem.triplet_rays(problem.triplets, cameras.lenses)
         poses = cameras.about_middle(images)
-        depth = depth_equations(rays, poses, scale, with_focals=with_focals)
+        depth = depth_equations(rays, poses, scale)
         chain = triplet_chain(cameras.rotations[images[:, 1]], poses)
         terms.append(CameraTerms.chained(images, depth.costs, depth.gradients, depth.hessians, chain))
     return terms
@@ -311,9 +339,9 @@ def _terms(problem: EpipolarProblem, cameras: Cameras, scale: float, *, near: bo
 
 def _cost(problem: EpipolarProblem, cameras: Cameras, scale: float) -> float:
     R, d, _ = cameras.relative(problem.edges)
-    cost = cauchy_costs(problem.matches(cameras.log_scales), R, d, np.full(len(R), scale)).sum()
+    cost = cauchy_costs(problem.matches(cameras.lenses), R, d, np.full(len(R), scale)).sum()
     if problem.triplets is not None:
-        rays = problem.triplet_rays(problem.triplets, cameras.log_scales)
+        rays = problem.triplet_rays(problem.triplets, cameras.lenses)
         cost += depth_costs(rays, cameras.about_middle(problem.triplets.images), scale).sum()
     return float(cost)
 
@@ -362,7 +390,7 @@ def _minimized(
     Far from the minimum (not `near`), where many matches have large errors, the steps are those of reweighted least
     squares, which are shorter but safer.
     """
-    system, damping = _system(problem), 1e-4
+    system, damping = normal_system(problem), 1e-4
     terms = _terms(problem, cameras, scale, near=near)
     before = _total(terms)
     for iteration in range(max_num_iterations):
@@ -384,7 +412,7 @@ def _minimized(
         log.append(LogEntry("epipolar", iteration + 1, cost, change))
         if change < end:
             return cameras, cost, True
-        if _focal_diverged(cameras):
+        if _lens_diverged(cameras):
             break
         terms = ahead if ahead is not None else _terms(problem, cameras, scale, near=near)
     return cameras, before, False

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletPoses, inverse_depths
-from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.linear.laplacian import LaplacianSystem, ReweightedLaplacian
 from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, MAD_TO_SIGMA, cauchy_weight, geman_mcclure_weight
 from colmap_vg.positions.fixed_point import edge_lengths
@@ -94,7 +94,7 @@ def estimate_baseline_ratios(problem: EpipolarProblem, relative_rotations: Array
         to_middle = (problem.edges[rows, 0] == triplets.images[:, other])[:, None]
         rotations.append(np.where(to_middle[:, :, None], R, np.swapaxes(R, 1, 2)))
         baselines.append(np.where(to_middle, np.einsum("kab,kb->ka", R, d), -d))
-    rays = problem.triplet_rays(triplets, np.zeros(len(problem.focal_lengths)))
+    rays = problem.triplet_rays(triplets, Lenses(np.zeros(len(problem.focal_lengths))))
     by_a, by_c = inverse_depths(rays, TripletPoses(np.stack(rotations), np.stack(baselines)))
     front = (by_a > 0) & (by_c > 0)
     offsets = segment_subset(triplets.offsets, front)

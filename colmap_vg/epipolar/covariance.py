@@ -17,9 +17,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.adjustment import AdjustmentResult, Cameras, edge_chain, triplet_chain
+from colmap_vg.epipolar.adjustment import AdjustmentResult, Cameras, edge_chain, normal_system, triplet_chain
 from colmap_vg.epipolar.depth_agreement import depth_derivatives_by_block, depth_equations
-from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
+from colmap_vg.epipolar.normal_system import CameraTerms
 from colmap_vg.epipolar.problem import EpipolarProblem
 from colmap_vg.geometry import so3
 from colmap_vg.linear.robust_losses import MAD_TO_SIGMA, cauchy_weight
@@ -78,14 +78,11 @@ def camera_covariances(
     """
     problem = problem.without(found.reversed_edges) if found.reversed_edges.any() else problem
     problem = replace(problem, free_focals=problem.free_focals & ~found.lost_focals)
-    cameras = Cameras(found.cam_from_world_rotations, found.projection_centers, np.log(found.focal_scales))
+    cameras = found.cameras
     kinds = _residuals(problem, cameras)
-    free = np.flatnonzero(problem.free_focals)
-    system = NormalSystem(
-        problem.num_images, [k.terms.images for k in kinds], problem.camera_idx, free, len(problem.focal_lengths)
-    )
+    system = normal_system(problem)
     factor = system.factor([kind.terms for kind in kinds])
-    num_parameters = 6 * problem.num_images - 7 + len(free)
+    num_parameters = 6 * problem.num_images - 7 + system.num_lens_unknowns
     sigma, own = _noise(kinds, found.scale_px, num_parameters)
     rng = np.random.default_rng(seed)
     num_keypoints = 1 + max(int(kind.keypoints.max(initial=-1)) for kind in kinds)
@@ -105,7 +102,7 @@ def camera_covariances(
 class _Residuals:
     """Residuals of pairs (s = 2 rays each) or triplets (s = 3), in segments with the same cameras.
 
-    Residuals (k,) in pixels; derivatives (k, b) by the segment's parameters and log focals, and (s, k, 3) by the
+    Residuals (k,) in pixels; derivatives (k, b) by the segment's parameters and lenses, and (s, k, 3) by the
     noise of its keypoints; keypoint numbers (s, k); derivatives (q, b', 6 s) of the parameters by the cameras.
     """
 
@@ -125,9 +122,9 @@ class _Residuals:
         return total
 
     def pull(self, dr: Array) -> tuple[Array, Array]:
-        """Gradients by poses (q, 6 s, draws) and log focals (q, s, draws) for changes (k, draws) of the residuals."""
+        """Gradients by poses (q, 6 s, draws) and lenses (q, t, draws) for changes (k, draws) of the residuals."""
         rows = np.arange(len(self.r))
-        q, b, wide = self.chain.shape
+        q, b, _ = self.chain.shape
         by_parameter = np.stack(
             [
                 sp.csr_array((column, rows, self.offsets), shape=(q, len(rows))) @ dr
@@ -135,18 +132,16 @@ class _Residuals:
             ],
             axis=1,
         )
-        by_focal = by_parameter[:, b:] if by_parameter.shape[1] > b else np.zeros((q, wide // 6, dr.shape[1]))
-        return np.swapaxes(self.chain, 1, 2) @ by_parameter[:, :b], by_focal
+        return np.swapaxes(self.chain, 1, 2) @ by_parameter[:, :b], by_parameter[:, b:]
 
 
 def _residuals(problem: EpipolarProblem, cameras: Cameras) -> list[_Residuals]:
     """Residuals of the pairs and, if there are any, of the triplets."""
-    with_focals, numbers = bool(problem.free_focals.any()), _numbered_keypoints(problem)
-    edges, (R, d, length) = problem.edges, cameras.relative(problem.edges)
-    matches = problem.matches(cameras.log_scales)
-    at = normal_equations(matches, R, d, np.full(len(edges), _UNWEIGHTED), with_focals=with_focals)
+    edges, numbers, (R, d, length) = problem.edges, _numbered_keypoints(problem), cameras.relative(problem.edges)
+    matches = problem.matches(cameras.lenses)
+    at = normal_equations(matches, R, d, np.full(len(edges), _UNWEIGHTED))
     chain = edge_chain(cameras.rotations[edges[:, 0]], R, d, length)
-    pairs = [part for *_, part in derivatives_by_block(matches, R, d, with_focals=with_focals)]
+    pairs = [part for *_, part in derivatives_by_block(matches, R, d)]
     kinds = [
         _Residuals(
             np.concatenate([p.r for p in pairs]),
@@ -159,11 +154,11 @@ def _residuals(problem: EpipolarProblem, cameras: Cameras) -> list[_Residuals]:
         )
     ]
     if problem.triplets is not None:
-        images, rays = problem.triplets.images, problem.triplet_rays(problem.triplets, cameras.log_scales)
+        images, rays = problem.triplets.images, problem.triplet_rays(problem.triplets, cameras.lenses)
         poses = cameras.about_middle(images)
-        depth = depth_equations(rays, poses, _UNWEIGHTED, with_focals=with_focals)
+        depth = depth_equations(rays, poses, _UNWEIGHTED)
         chain = triplet_chain(cameras.rotations[images[:, 1]], poses)
-        tracks = [part for *_, part in depth_derivatives_by_block(rays, poses, with_focals=with_focals)]
+        tracks = [part for *_, part in depth_derivatives_by_block(rays, poses)]
         kinds.append(
             _Residuals(
                 np.concatenate([t.r for t in tracks]),

@@ -12,7 +12,7 @@ point is triangulated. Derivatives include those of s: with ``G = dh/du`` and ``
 derivative of ``s^2 = sum g . G`` is the derivative of G along g.
 
 The parameters of a triplet are rotations of the rays of a and c in the frame of b (3 + 3), t of a and of c (3 + 3), and
-the logarithms of the three focal lengths.
+of the lenses the logarithms of the three focal lengths and a radial term of all.
 """
 
 from collections.abc import Iterator
@@ -39,11 +39,20 @@ class TripletRays:
         ``1 / f^2``, squared radians per squared pixel.
     focal_ratios : (3, q) array or None
         Old over new focal length: the first two coordinates of the rays are multiplied by it, and the rays normalised.
+        None if no focal length is an unknown.
+    radial_gains : (p, 3, length) array or None
+        Shift of each ray by the radial term over that by the log focal length; None if the term is no unknown.
     """
 
     pieces: Pieces
     variances: Array
     focal_ratios: Array | None = None
+    radial_gains: Array | None = None
+
+    @property
+    def num_lens_unknowns(self) -> int:
+        """Unknowns of each triplet beside its poses: none, three log focal lengths, or these and the radial term."""
+        return 0 if self.focal_ratios is None else 3 + (self.radial_gains is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,15 +105,13 @@ def depth_costs(rays: TripletRays, poses: TripletPoses, scale: float) -> Array:
     return scale**2 * costs
 
 
-def depth_equations(
-    rays: TripletRays, poses: TripletPoses, scale: float, *, with_focals: bool = False
-) -> TripletEquations:
-    """Cauchy costs and normal equations by (rotation of a, of c, t of a, of c) and, `with_focals`, the log focals."""
-    q, b = rays.pieces.num_segments, 15 if with_focals else 12
+def depth_equations(rays: TripletRays, poses: TripletPoses, scale: float) -> TripletEquations:
+    """Cauchy costs and normal equations by (rotation of a, of c, t of a, of c) and the lens unknowns of the rays."""
+    q, b = rays.pieces.num_segments, 12 + rays.num_lens_unknowns
     costs, products = np.zeros(q), np.zeros((q, b, b + 1))
     for block in rays.pieces.blocks():
         at = _evaluate(rays, poses, block)
-        columns = _jacobian_and_residuals(at, with_focals)
+        columns = _jacobian_and_residuals(at)
         ratio = np.square(at.r / scale)
         weighted = columns[:, :b] / (1.0 + ratio)[:, None]
         costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
@@ -117,7 +124,7 @@ def depth_equations(
 
 @dataclass(frozen=True, eq=False)
 class DepthDerivatives:
-    """Residuals (k,) in pixels, with derivatives by the poses and log focals (b, k) and by the keypoints.
+    """Residuals (k,) in pixels, with derivatives by the poses and lens unknowns (b, k) and by the keypoints.
 
     `by_rays` (3, 3, k) are derivatives by the rays in images a, b, c, tangent to them in the frames of their cameras,
     per pixel of keypoint noise (its effect on s is neglected); the squared norms sum to one.
@@ -129,7 +136,7 @@ class DepthDerivatives:
 
 
 def depth_derivatives_by_block(
-    rays: TripletRays, poses: TripletPoses, *, with_focals: bool = False
+    rays: TripletRays, poses: TripletPoses
 ) -> Iterator[tuple[slice, slice, IntArray, DepthDerivatives]]:
     """Iterate over runs of whole triplets: their slice, the slice of their rows, relative offsets, and derivatives."""
     pieces = rays.pieces
@@ -138,7 +145,7 @@ def depth_derivatives_by_block(
         by_rays = np.stack(at.along) / np.sqrt(at.variances * at.variance)[:, None]
         for image in (0, 2):
             by_rays[image] = _rotated(np.swapaxes(at.turns[image // 2], 1, 2), np.moveaxis(by_rays[image], 0, 1))
-        by_pose = np.moveaxis(_jacobian_and_residuals(at, with_focals)[:, :-1], 1, 0)
+        by_pose = np.moveaxis(_jacobian_and_residuals(at)[:, :-1], 1, 0)
         offsets = pieces.offsets[block.segments.start : block.segments.stop + 1]
         yield (
             block.segments,
@@ -170,7 +177,7 @@ class _Tracks:
     """Residuals r of a block of tracks with dh/du of each image (`by_ray`), g (`along`), g . G (`noise`) and s^2.
 
     Vectors are (3, pieces, length); own rays (3, pieces, 3, length), rotations `turns` (2, pieces, 3, 3), variances
-    (3, pieces, 1).
+    (3, pieces, 1), gains of the radial term (3, pieces, length).
     """
 
     own: Array
@@ -183,6 +190,8 @@ class _Tracks:
     noise: list[Array]
     variance: Array
     r: Array
+    num_lens_unknowns: int
+    radial_gains: Array | None
 
 
 def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
@@ -203,7 +212,10 @@ def _evaluate(rays: TripletRays, poses: TripletPoses, block: Block) -> _Tracks:
         noise.append(v * _dot(tangential, tangential))
     variance = np.maximum(noise[0] + noise[1] + noise[2], np.finfo(float).tiny)
     r = (a.rho - c.rho) / np.sqrt(variance)
-    return _Tracks(own, turns, middle, variances, (a, c), by_ray, along, noise, variance, r)
+    gains = None if rays.radial_gains is None else np.moveaxis(rays.radial_gains[block.pieces], 1, 0)
+    return _Tracks(
+        own, turns, middle, variances, (a, c), by_ray, along, noise, variance, r, rays.num_lens_unknowns, gains
+    )
 
 
 def _rotated(turns: Array, x: Array) -> Array:
@@ -246,8 +258,8 @@ def _derivative(side: _Side, middle: Array, du: Array, dmiddle: Array) -> tuple[
     return by_middle, by_own, _cross(dbeta, side.u) + _cross(side.beta, du)
 
 
-def _jacobian_and_residuals(at: _Tracks, with_focals: bool) -> Array:
-    """Derivatives of the residuals (12, or 15 with focal lengths), then the residuals: (pieces, 13 or 16, length)."""
+def _jacobian_and_residuals(at: _Tracks) -> Array:
+    """Derivatives of the residuals by poses (12) and lens unknowns, then the residuals: (pieces, b + 1, length)."""
     (a, c), rays = at.sides, (at.sides[0].u, at.middle, at.sides[1].u)
     bend_a = _derivative(a, at.middle, at.along[0], at.along[1])
     bend_c = _derivative(c, at.middle, at.along[2], at.along[1])
@@ -259,18 +271,22 @@ def _jacobian_and_residuals(at: _Tracks, with_focals: bool) -> Array:
         for G, bend, u, along in zip(at.by_ray, bends, rays, at.along, strict=True)
     ]
     count, length = at.r.shape
-    whole = np.empty((count, 16 if with_focals else 13, length))
+    whole = np.empty((count, 13 + at.num_lens_unknowns, length))
     J = np.moveaxis(whole, 1, 0)
     J[0:3], J[3:6] = _cross(a.u, by_ray[0]), _cross(c.u, by_ray[2])
     J[6:9] = a.by_baseline * inverse - ratio * bend_a[2]
     J[9:12] = -(c.by_baseline * inverse - ratio * bend_c[2])
-    if with_focals:
+    if at.num_lens_unknowns:
         axis = np.array([0.0, 0.0, 1.0])[:, None]
         for k, x in enumerate(at.own):
             depth = x[:, 2:]
             pull = depth * (axis - depth * x)
             pull = np.moveaxis(pull, 1, 0) if k == 1 else _rotated(at.turns[k // 2], pull)
-            J[12 + k] = _dot(by_ray[k], pull) + ratio * at.noise[k]
+            J[12 + k] = _dot(by_ray[k], pull)
+        if at.radial_gains is not None:
+            J[15] = np.sum(at.radial_gains * J[12:15], axis=0)
+        for k in range(3):  # a longer focal length reduces the angle of a pixel, too
+            J[12 + k] += ratio * at.noise[k]
     J[-1] = at.r
     return whole
 

@@ -1,4 +1,4 @@
-"""Sparse normal equations of camera poses and shared focal lengths, from cost terms of two or three cameras each."""
+"""Sparse normal equations of camera poses and shared lenses, from cost terms of two or three cameras each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,39 +27,38 @@ class CameraTerms:
     costs : (q,) array
     pose_gradients : (q, 6 s) array
         Derivatives by rotation and position of each image.
-    focal_gradients : (q, s) array
-        Derivatives by the log focal lengths of the images' cameras; zero if none is free.
+    lens_gradients : (q, t) array
+        Derivatives by lens unknowns: none, or the log focal lengths of the images' cameras (t = s), or these and a
+        radial term that all cameras share (t = s + 1).
     pose_blocks : (q, 6 s, 6 s) array
         Hessians by poses.
-    cross_blocks : (q, 6 s, s) array
-        Hessians by poses and log focal lengths.
-    focal_blocks : (q, s, s) array
-        Hessians by log focal lengths.
+    cross_blocks : (q, 6 s, t) array
+        Hessians by poses and lens unknowns.
+    lens_blocks : (q, t, t) array
+        Hessians by lens unknowns.
     """
 
     images: IntArray
     costs: Array
     pose_gradients: Array
-    focal_gradients: Array
+    lens_gradients: Array
     pose_blocks: Array
     cross_blocks: Array
-    focal_blocks: Array
+    lens_blocks: Array
 
     @classmethod
     def chained(cls, images: IntArray, costs: Array, gradients: Array, hessians: Array, chain: Array) -> "CameraTerms":
-        """Apply the chain rule: derivatives (q, b + s) by b parameters and s log focals, chain (q, b, 6 s) to poses."""
-        q, b, _ = chain.shape
-        s = images.shape[1]
+        """Apply the chain rule: derivatives (q, b + t) by b parameters and t of lenses, chain (q, b, 6 s) to poses."""
+        b = chain.shape[1]
         turned = np.swapaxes(chain, 1, 2)
-        with_focals = gradients.shape[1] > b
         return cls(
             images,
             costs,
             (gradients[:, None, :b] @ chain)[:, 0],
-            gradients[:, b:] if with_focals else np.zeros((q, s)),
+            gradients[:, b:],
             turned @ hessians[:, :b, :b] @ chain,
-            turned @ hessians[:, :b, b:] if with_focals else np.zeros((q, 6 * s, s)),
-            hessians[:, b:, b:] if with_focals else np.zeros((q, s, s)),
+            turned @ hessians[:, :b, b:],
+            hessians[:, b:, b:],
         )
 
 
@@ -76,32 +75,44 @@ class NormalSystem:
     free : (f,) int64 array
         Cameras whose focal lengths are unknowns.
     num_cameras : int
+    with_radial : bool
+        Whether a radial term is the last unknown.
     """
 
     def __init__(
-        self, num_images: int, images: Sequence[IntArray], camera_idx: IntArray, free: IntArray, num_cameras: int
+        self,
+        num_images: int,
+        images: Sequence[IntArray],
+        camera_idx: IntArray,
+        free: IntArray,
+        num_cameras: int,
+        *,
+        with_radial: bool = False,
     ) -> None:
         self.num_images, self.free = num_images, free
+        self.num_lens_unknowns = len(free) + with_radial
         place = np.full(num_cameras, -1)
         place[free] = np.arange(len(free))
         self._images, self._slots = list(images), [place[camera_idx[i]] for i in images]
+        if with_radial:
+            self._slots = [np.pad(slot, ((0, 0), (0, 1)), constant_values=len(free)) for slot in self._slots]
         self._pattern = BlockPattern(num_images, np.concatenate([_pairs(i) for i in images]), 6)
 
     def gradient(self, terms: Sequence[CameraTerms]) -> Array:
-        """Sum of the terms' gradients: (6 n + f,)."""
-        return self.summed([t.pose_gradients for t in terms], [t.focal_gradients for t in terms])
+        """Sum of the terms' gradients: (6 n + u,), u lens unknowns."""
+        return self.summed([t.pose_gradients for t in terms], [t.lens_gradients for t in terms])
 
-    def summed(self, by_poses: Sequence[Array], by_focals: Sequence[Array]) -> Array:
-        """Sum columns by poses (q, 6 s, ...) and by log focals (q, s, ...) over all terms: (6 n + f, ...)."""
-        columns = by_poses[0].shape[2:]
+    def summed(self, by_poses: Sequence[Array], by_lenses: Sequence[Array]) -> Array:
+        """Sum columns by poses (q, 6 s, ...) and by lenses (q, t, ...) over all terms: (6 n + u, ...)."""
+        columns, count = by_poses[0].shape[2:], self.num_lens_unknowns
         poses = np.zeros((self.num_images, 6, *columns))
-        focals = np.zeros((len(self.free), *columns))
-        for images, slot, by_pose, by_focal in zip(self._images, self._slots, by_poses, by_focals, strict=True):
+        lenses = np.zeros((count, *columns))
+        for images, slot, by_pose, by_lens in zip(self._images, self._slots, by_poses, by_lenses, strict=True):
             poses += sum_at_nodes(self.num_images, images.ravel(), by_pose.reshape(-1, 6, *columns))
             used = slot >= 0
-            if len(self.free):
-                focals += sum_at_nodes(len(self.free), slot[used], by_focal[used])
-        return np.concatenate([poses.reshape(-1, *columns), focals])
+            if count:
+                lenses += sum_at_nodes(count, slot[used], by_lens[used])
+        return np.concatenate([poses.reshape(-1, *columns), lenses])
 
     def factor(self, terms: Sequence[CameraTerms]) -> Factor:
         """Factor the Hessian, damped only as much as the gauge requires.
@@ -114,7 +125,7 @@ class NormalSystem:
         return factorize(self._matrix(terms, 0.0))
 
     def step(self, terms: Sequence[CameraTerms], gradient: Array, damping: float) -> Array | None:
-        """Levenberg step (6 n + f,) with damping relative to the diagonal; None if the matrix is still singular."""
+        """Levenberg step (6 n + u,) with damping relative to the diagonal; None if the matrix is still singular."""
         try:
             return -factorize(self._matrix(terms, damping)).solve(gradient)
         except SingularMatrixError:
@@ -130,18 +141,18 @@ class NormalSystem:
             diagonal += sum_at_nodes(n, t.images.ravel(), own)
         level = damping * diagonal + MIN_DAMPING * diagonal.max(axis=0)
         matrix = self._pattern.assemble(ii, jj, ij, level[:, :, None] * np.eye(6))
-        return self._bordered(matrix, terms, damping) if len(self.free) else matrix
+        return self._bordered(matrix, terms, damping) if self.num_lens_unknowns else matrix
 
     def _bordered(self, poses: sp.csc_array, terms: Sequence[CameraTerms], damping: float) -> sp.csc_array:
-        n, f = self.num_images, len(self.free)
-        cross, focal = sp.csc_array((6 * n, f)), sp.csc_array((f, f))
+        n, u = self.num_images, self.num_lens_unknowns
+        cross, lenses = sp.csc_array((6 * n, u)), sp.csc_array((u, u))
         for term, slot in zip(terms, self._slots, strict=True):
             unknown = (6 * term.images[:, :, None] + np.arange(6)).reshape(len(slot), -1)
-            cross = cross + _scattered(term.cross_blocks, unknown, slot, (6 * n, f))
-            focal = focal + _scattered(term.focal_blocks, slot, slot, (f, f))
-        level = focal.diagonal() * damping
-        focal = focal + sp.diags_array(level + 1e-12 * max(float(focal.diagonal().max()), 1e-300))
-        return sp.csc_array(sp.block_array([[poses, cross], [cross.T, focal]]))
+            cross = cross + _scattered(term.cross_blocks, unknown, slot, (6 * n, u))
+            lenses = lenses + _scattered(term.lens_blocks, slot, slot, (u, u))
+        level = lenses.diagonal() * damping
+        lenses = lenses + sp.diags_array(level + 1e-12 * max(float(lenses.diagonal().max()), 1e-300))
+        return sp.csc_array(sp.block_array([[poses, cross], [cross.T, lenses]]))
 
 
 def _pairs(images: IntArray) -> IntArray:

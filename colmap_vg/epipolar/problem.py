@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletRays
 from colmap_vg.epipolar.triplets import Triplets, find_triplets
-from colmap_vg.geometry.directions import normalized
 from colmap_vg.options import SolveOptions
 from colmap_vg.scene.subgraph import Subgraph
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.two_view.pieces import Pieces
+from colmap_vg.two_view.radial_distortion import undistorted_rays
 from colmap_vg.two_view.sampson import Matches, cut_rays
-from colmap_vg.two_view.segments import rows_of_segments, segment_of_rows, segment_subset
+from colmap_vg.two_view.segments import rows_of_segments, segment_subset
 from colmap_vg.two_view.spread import well_spread
 
 Array = NDArray[np.float64]
@@ -22,10 +22,12 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 
-MIN_AXIAL = 0.3
-"""Least cosine between the optical axis and a ray that is undistorted."""
-NEWTON_STEPS, MIN_SLOPE = 8, 0.1
-"""Newton steps to undistort a radius, and lower limit of the slope of the distortion polynomial in them."""
+@dataclass(frozen=True, eq=False)
+class Lenses:
+    """Logarithms (c,) of the factors on the focal lengths, and the radial term at the initial focal lengths."""
+
+    log_scales: Array
+    radial_term: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,8 @@ class EpipolarProblem:
         Tracks shared by three images, which determine the ratios of baselines.
     keypoints1, keypoints2 : (k,) int array or None
         Keypoint indices of the matches in image 1 and image 2.
+    bent_cameras : (c,) bool array or None
+        Cameras of free focal length that share a radial term, which is refined; None if there is no term.
     """
 
     num_images: int
@@ -63,16 +67,24 @@ class EpipolarProblem:
     triplets: Triplets | None = None
     keypoints1: NDArray[np.int32] | None = None
     keypoints2: NDArray[np.int32] | None = None
+    bent_cameras: BoolArray | None = None
 
     @cached_property
     def _pieces(self) -> Pieces:
         return cut_rays(self.offsets, self.bearings1, self.bearings2)
 
-    def matches(self, log_scales: Array) -> Matches:
-        """Matches with the focal lengths multiplied by factors, given by their logarithms (c,)."""
+    @property
+    def lenses_are_free(self) -> bool:
+        """Whether any focal length is refined."""
+        return bool(self.free_focals.any())
+
+    def matches(self, lenses: Lenses) -> Matches:
+        """Matches as cameras with the given lenses see them."""
         camera = self.camera_idx[self.edges].T
-        focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
-        return Matches(self._pieces, focal**-2.0, np.exp(-log_scales[camera]) if self.free_focals.any() else None)
+        focal = self.focal_lengths[camera] * np.exp(lenses.log_scales[camera])
+        ratios = np.exp(-lenses.log_scales[camera]) if self.lenses_are_free else None
+        pieces, gains = self._straightened(self._pieces, camera, lenses)
+        return Matches(pieces, focal**-2.0, ratios, gains)
 
     def without(self, dropped: BoolArray) -> "EpipolarProblem":
         """The problem without the edges of a mask (m,)."""
@@ -89,48 +101,25 @@ class EpipolarProblem:
             keypoints2=None if self.keypoints2 is None else self.keypoints2[rows],
         )
 
-    def undistorted(self, radial_term: float, cameras: BoolArray) -> "EpipolarProblem":
-        """The problem after undistorting the rays of some cameras (c,) by a radial term as in COLMAP's models."""
-        terms = np.where(cameras, radial_term, 0.0)[self.camera_idx]
-        image = self.edges[segment_of_rows(self.offsets)]
-        triplets = self.triplets
-        if triplets is not None:
-            seen_by = triplets.images[segment_of_rows(triplets.offsets)].T
-            bearings = [
-                _undistorted(rays.T, terms[images]).T for rays, images in zip(triplets.bearings, seen_by, strict=True)
-            ]
-            triplets = replace(triplets, bearings=np.stack(bearings))
-        return replace(
-            self,
-            bearings1=_undistorted(self.bearings1, terms[image[:, 0]]),
-            bearings2=_undistorted(self.bearings2, terms[image[:, 1]]),
-            triplets=triplets,
-        )
-
-    def triplet_rays(self, triplets: Triplets, log_scales: Array) -> TripletRays:
-        """Rays of triplets with the focal lengths multiplied by factors, given by their logarithms (c,)."""
+    def triplet_rays(self, triplets: Triplets, lenses: Lenses) -> TripletRays:
+        """Rays of triplets as cameras with the given lenses see them."""
         camera = self.camera_idx[triplets.images].T
-        focal = self.focal_lengths[camera] * np.exp(log_scales[camera])
-        focal_ratios = np.exp(-log_scales[camera]) if self.free_focals.any() else None
-        return TripletRays(triplets.pieces, focal**-2.0, focal_ratios)
+        focal = self.focal_lengths[camera] * np.exp(lenses.log_scales[camera])
+        ratios = np.exp(-lenses.log_scales[camera]) if self.lenses_are_free else None
+        pieces, gains = self._straightened(triplets.pieces, camera, lenses)
+        return TripletRays(pieces, focal**-2.0, ratios, gains)
 
-
-def _undistorted(rays: Array, radial_terms: Array) -> Array:
-    """Undistorted unit rays (k, 3): the given ones have normalised coordinates ``u (1 + k |u|^2)``.
-
-    Rays far off the axis, where the polynomial is not valid, are returned unchanged.
-    """
-    z = rays[:, 2]
-    near = z > MIN_AXIAL
-    distorted = np.where(near, np.hypot(rays[:, 0], rays[:, 1]) / np.where(near, z, 1.0), 0.0)
-    radius = distorted.copy()
-    # With a negative term the polynomial has a maximum, beyond which it is not invertible.
-    limit = np.where(radial_terms < 0.0, np.sqrt(1.0 / np.maximum(-3.0 * radial_terms, 1e-12)), np.inf)
-    for _ in range(NEWTON_STEPS):
-        slope = np.maximum(1.0 + 3.0 * radial_terms * radius**2, MIN_SLOPE)
-        radius = np.clip(radius - (radius * (1.0 + radial_terms * radius**2) - distorted) / slope, 0.0, limit)
-    factor = np.where(distorted > 0.0, radius / np.where(distorted > 0.0, distorted, 1.0), 1.0)
-    return normalized(np.concatenate([rays[:, :2] * factor[:, None], z[:, None]], axis=1))
+    def _straightened(self, pieces: Pieces, camera: IntArray, lenses: Lenses) -> tuple[Pieces, Array | None]:
+        """Pieces of rays after undistortion, and gains (p, s, length), for segments with cameras (s, m)."""
+        if self.bent_cameras is None:
+            return pieces, None
+        bent = self.bent_cameras[camera[:, pieces.segments]]
+        parts = [
+            undistorted_rays(pieces.columns[:, 3 * s : 3 * s + 3], lenses.radial_term, seen)
+            for s, seen in enumerate(bent)
+        ]
+        rays, gains = zip(*parts, strict=True)
+        return replace(pieces, columns=np.concatenate(rays, axis=1)), np.stack(gains, axis=1)
 
 
 def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) -> EpipolarProblem | None:

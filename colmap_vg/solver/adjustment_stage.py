@@ -18,6 +18,7 @@ from colmap_vg.solver.part_poses import PartPoses
 from colmap_vg.solver.state import SolverState
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 CONTRADICTION = 10.0
@@ -38,10 +39,11 @@ def adjust_poses(
     directions = state.graph.cam2_in_cam1_directions[part.edge_rows]
     found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
     state.log.extend(found.log)
-    problem, found, radial_terms = _with_radial_term(state, problem, found, directions)
+    problem, found = _with_radial_term(state, problem, found, directions)
     state.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
-    # Relative poses from distorted rays are not comparable with poses from undistorted ones.
-    dropped = found.reversed_edges | (_contradicting(state, part, problem, found) & (radial_terms is None))
+    dropped = found.reversed_edges.copy()
+    if problem.bent_cameras is None:  # relative poses from distorted rays are not comparable with those without
+        dropped |= _contradicting(state, part, problem, found)
     if dropped.sum() > found.reversed_edges.sum():
         state.drop(part.edge_rows[dropped & ~found.reversed_edges], EdgeVerdict.CONTRADICTS_POSES)
         rest = problem.without(dropped)
@@ -49,13 +51,14 @@ def adjust_poses(
         if state.largest_rigid_part(kept, options.random_seed).num_images < part.num_images:
             # Tracks that were not needed before may determine the remaining positions.
             rest = epipolar_problem(state.graph, kept, options) or rest
-        rest = replace(rest, free_focals=problem.free_focals & ~found.lost_focals)
+        free = problem.free_focals & ~found.lost_focals
+        rest = replace(rest, free_focals=free, bent_cameras=problem.bent_cameras)
         again = adjust_epipolar(
             rest,
             found.cam_from_world_rotations,
             found.projection_centers,
             directions[~dropped],
-            initial_focal_scales=found.focal_scales,
+            initial_lenses=found.cameras.lenses,
             scales_px=(found.scale_px,),
             final_sigmas=0.0,
         )
@@ -76,7 +79,7 @@ def adjust_poses(
         found.projection_centers[rows],
         found.focal_scales[group],
         found.converged,
-        radial_terms=radial_terms,
+        radial_terms=_radial_terms(problem, found, group),
     )
     if options.covariances:
         known = camera_covariances(problem, found, seed=options.random_seed)
@@ -86,28 +89,35 @@ def adjust_poses(
 
 def _with_radial_term(
     state: SolverState, problem: EpipolarProblem, found: AdjustmentResult, directions: Array
-) -> tuple[EpipolarProblem, AdjustmentResult, Array | None]:
-    """Estimate a radial term if focal lengths are free; return the problem, its cameras and the radial terms (c,)."""
+) -> tuple[EpipolarProblem, AdjustmentResult]:
+    """Estimate a radial term if focal lengths are free; return the problem, with the term if there is one, solved."""
     graph, (group, first) = state.graph, focal_groups(state.graph)
     free = problem.free_focals & ~found.lost_focals
     if graph.camera_radial is None or not free.any():
-        return problem, found, None
+        return problem, found
     free_radials = free & (np.bincount(group, weights=~graph.camera_radial, minlength=len(first)) == 0)
     lens = fit_radial_term(problem, found, free_radials) if free_radials.any() else None
     if lens is None:
-        return problem, found, None
+        return problem, found
     start = lens.result
     again = adjust_epipolar(
         lens.problem,
         start.cam_from_world_rotations,
         start.projection_centers,
         directions,
-        initial_focal_scales=start.focal_scales,
+        initial_lenses=start.cameras.lenses,
         scales_px=(start.scale_px,),
+        near=True,
     )
     state.log.extend(again.log)
-    terms = np.where(free_radials, lens.radial_term * np.square(again.focal_scales), 0.0)[group]
-    return lens.problem, again, np.asarray(terms)
+    return lens.problem, again
+
+
+def _radial_terms(problem: EpipolarProblem, found: AdjustmentResult, group: IntArray) -> Array | None:
+    """Radial terms (c,) of the graph's cameras at their focal lengths; None without."""
+    if problem.bent_cameras is None:
+        return None
+    return np.asarray(np.where(problem.bent_cameras, found.radial_term * np.square(found.focal_scales), 0.0)[group])
 
 
 def _contradicting(state: SolverState, part: Subgraph, problem: EpipolarProblem, found: AdjustmentResult) -> BoolArray:

@@ -6,9 +6,9 @@ and ``z = (R Q)^T x2`` for unit bearings x1, x2, the epipolar constraint and its
     c = x2^T R [d]_x x1 = z_1 y_2 - z_2 y_1,    s^2 = (1 - y_3^2 - c^2) / f_2^2 + (1 - z_3^2 - c^2) / f_1^2,
 
 and the residual ``r = c / s`` is in pixels (Sampson error on the tangent planes of the bearings). Derivatives include
-those of s. The parameters of an edge are ``R <- R exp(Q w)``, ``d <- Q (tau, 1)`` normalised, and the logarithms of its
-two focal lengths: a longer focal length moves a bearing x towards the axis, ``dx = x_3 (e_3 - x_3 x)``, and reduces the
-angle of a pixel.
+those of s. The parameters of an edge are ``R <- R exp(Q w)``, ``d <- Q (tau, 1)`` normalised, and of its lenses the
+logarithms of the two focal lengths and a radial term of both. A longer focal length moves a bearing x towards the axis,
+``dx = x_3 (e_3 - x_3 x)``, and reduces the angle of a pixel; the radial term moves it likewise, by a factor per ray.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized, tangent_basis
 from colmap_vg.two_view.pieces import Block, Pieces, rescaled_rays
-from colmap_vg.two_view.segments import segment_quantiles
+from colmap_vg.two_view.segments import rows_of_segments, segment_quantiles
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -39,12 +39,20 @@ class Matches:
         ``1 / f^2`` of camera 1 and 2, squared radians per squared pixel.
     focal_ratios : (2, m) array or None
         Old over new focal length of camera 1 and 2: the first two coordinates of the rays are multiplied by it, and the
-        rays normalised.
+        rays normalised. None if no focal length is an unknown.
+    radial_gains : (p, 2, length) array or None
+        Shift of each ray by the radial term over that by the log focal length; None if the term is no unknown.
     """
 
     pieces: Pieces
     variances: Array
     focal_ratios: Array | None = None
+    radial_gains: Array | None = None
+
+    @property
+    def num_lens_unknowns(self) -> int:
+        """Unknowns of each edge beside its pose: none, two log focal lengths, or these and the radial term."""
+        return 0 if self.focal_ratios is None else 2 + (self.radial_gains is not None)
 
     @classmethod
     def of_rays(
@@ -61,7 +69,10 @@ class Matches:
     def of(self, edges: IntArray) -> "Matches":
         """Matches of the given edges, in the given order."""
         focal_ratios = None if self.focal_ratios is None else self.focal_ratios[:, edges]
-        return Matches(self.pieces.of(edges), self.variances[:, edges], focal_ratios)
+        gains = self.radial_gains
+        if gains is not None and len(edges) < self.pieces.num_segments:
+            gains = gains[rows_of_segments(self.pieces.starts, edges)[0]]
+        return Matches(self.pieces.of(edges), self.variances[:, edges], focal_ratios, gains)
 
 
 def cut_rays(offsets: IntArray, bearings1: Array, bearings2: Array) -> Pieces:
@@ -90,7 +101,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class SampsonDerivatives:
-    """Residuals (k,) in pixels, with derivatives by (w, tau) and the log focals (b, k), and by the keypoints.
+    """Residuals (k,) in pixels, with derivatives by (w, tau) and the lens unknowns (b, k), and by the keypoints.
 
     `by_ray1` and `by_ray2` (3, k) are tangent to the rays, in the frames of their cameras, per pixel of keypoint noise.
     The effect of the noise on s, of second order, is neglected. Their squared norms sum to one.
@@ -130,17 +141,15 @@ def median_errors(matches: Matches, R: Array, d: Array) -> Array:
     return segment_quantiles(matches.pieces.offsets, np.abs(residuals(matches, R, d)))
 
 
-def normal_equations(
-    matches: Matches, R: Array, d: Array, scales: Array, *, with_focals: bool = False
-) -> NormalEquations:
-    """Cauchy costs and normal equations by (w, tau), b = 5, and `with_focals` the two log focal lengths, b = 7."""
-    m, b, squared_scales = len(R), 7 if with_focals else 5, np.square(scales)
+def normal_equations(matches: Matches, R: Array, d: Array, scales: Array) -> NormalEquations:
+    """Cauchy costs and normal equations by (w, tau) and the lens unknowns of the matches, b = 5, 7 or 8."""
+    m, b, squared_scales = len(R), 5 + matches.num_lens_unknowns, np.square(scales)
     costs, products, slopes = np.zeros(m), np.zeros((m, b, b + 1)), np.ones(m)
     for block, at in _by_block(matches, R, d):
         ratio = at.r * at.r / squared_scales[at.edge][:, None]
         weights = 1.0 / (1.0 + ratio)
         slopes[block.segments] = _mean_slopes(matches.pieces, block, weights)
-        columns = _jacobian_and_residuals(at, with_focals, np.sqrt(weights))
+        columns = _jacobian_and_residuals(at, np.sqrt(weights))
         costs[block.segments] = block.totals(np.log1p(ratio).sum(axis=1))
         products[block.segments] = block.totals(columns[:, :b] @ np.swapaxes(columns, 1, 2))
     hessians = products[:, :, :b]
@@ -164,7 +173,7 @@ def residuals(matches: Matches, R: Array, d: Array) -> Array:
 
 
 def derivatives_by_block(
-    matches: Matches, R: Array, d: Array, *, with_focals: bool = False
+    matches: Matches, R: Array, d: Array
 ) -> Iterator[tuple[slice, slice, IntArray, "SampsonDerivatives"]]:
     """Iterate over runs of whole edges: their slice, the slice of their rows, relative offsets, and derivatives."""
     pieces = matches.pieces
@@ -181,7 +190,7 @@ def derivatives_by_block(
         ):
             line = np.stack([Q[:, a, 0, None] * first + Q[:, a, 1, None] * second for a in range(3)])
             rays.append(pieces.rows((line - at.c * np.moveaxis(x, 1, 0)) * np.sqrt(v / at.variance), block))
-        by_pose = np.moveaxis(_jacobian_and_residuals(at, with_focals)[:, :-1], 1, 0)
+        by_pose = np.moveaxis(_jacobian_and_residuals(at)[:, :-1], 1, 0)
         offsets = pieces.offsets[block.segments.start : block.segments.stop + 1]
         yield (
             block.segments,
@@ -196,7 +205,8 @@ class _AtFrames:
     """Coordinates of a block's matches in the frames of their edges, with constraints, variances and residuals.
 
     Scalars per match are (pieces, length), vectors (3, pieces, length); per piece there are the edge (pieces,), frames
-    (pieces, 3, 3) and variances (pieces, 1). Depths are the third coordinates of the rays in their cameras.
+    (pieces, 3, 3) and variances (pieces, 1). Depths are the third coordinates of the rays in their cameras. Gains
+    (2, pieces, length) are those of the radial term.
     """
 
     edge: IntArray
@@ -211,6 +221,8 @@ class _AtFrames:
     c: Array
     variance: Array
     r: Array
+    num_lens_unknowns: int
+    radial_gains: Array | None
 
 
 def _by_block(matches: Matches, R: Array, d: Array) -> Iterator[tuple[Block, _AtFrames]]:
@@ -232,7 +244,9 @@ def _at_frames(matches: Matches, frames1: Array, frames2: Array, block: Block) -
     # 1 - y_3^2 without cancellation near the epipole; the floor keeps a match at both epipoles finite.
     variance = (y[0] * y[0] + y[1] * y[1] - squared) * v2 + (z[0] * z[0] + z[1] * z[1] - squared) * v1
     np.maximum(variance, 1e-12 * (v1 + v2), out=variance)
-    return _AtFrames(edge, Q1, Q2, depth1, depth2, y, z, v1, v2, c, variance, c / np.sqrt(variance))
+    r = c / np.sqrt(variance)
+    gains = None if matches.radial_gains is None else np.moveaxis(matches.radial_gains[block.pieces], 1, 0)
+    return _AtFrames(edge, Q1, Q2, depth1, depth2, y, z, v1, v2, c, variance, r, matches.num_lens_unknowns, gains)
 
 
 def _rotated(Q: Array, x: Array, focal_ratio: Array | None) -> tuple[Array, Array]:
@@ -249,8 +263,8 @@ def _rotated(Q: Array, x: Array, focal_ratio: Array | None) -> tuple[Array, Arra
     return np.moveaxis(turned, 1, 0), depth * inverse
 
 
-def _jacobian_and_residuals(at: _AtFrames, with_focals: bool, weights: Array | float = 1.0) -> Array:
-    """Derivatives of the residuals (5, or 7 with focal lengths), then the residuals: (pieces, 6 or 8, length).
+def _jacobian_and_residuals(at: _AtFrames, weights: Array | float = 1.0) -> Array:
+    """Derivatives of the residuals by pose (5) and lens unknowns, then the residuals: (pieces, 6, 8 or 9, length).
 
     With the derivative ``c'`` of the constraint and ``h + c c' (-v_1 - v_2)``, half that of s^2,
     ``r' = c' (1 / s + r c (v_1 + v_2) / s^2) - h r / s^2``. All are multiplied by the weights (pieces, length).
@@ -261,20 +275,23 @@ def _jacobian_and_residuals(at: _AtFrames, with_focals: bool, weights: Array | f
     bend *= weights
     bend1, bend2 = bend * at.v1, bend * at.v2
     along1, along2 = bend2 * y[2], bend1 * z[2]
-    J = np.empty((len(c), 8 if with_focals else 6, c.shape[1]))
+    J = np.empty((len(c), 6 + at.num_lens_unknowns, c.shape[1]))
     J[:, 0] = -gain * y[0] * z[2] - along2 * z[1]
     J[:, 1] = along2 * z[0] - gain * y[1] * z[2]
     J[:, 2] = gain * (y[0] * z[0] + y[1] * z[1])
     J[:, 3] = gain * (z[1] * y[2] - z[2] * y[1]) + along1 * y[0] + along2 * z[0]
     J[:, 4] = gain * (z[2] * y[0] - z[0] * y[2]) + along1 * y[1] + along2 * z[1]
-    if with_focals:
+    if at.num_lens_unknowns:
         depth1, depth2 = at.depth1, at.depth2
         dy = [depth1 * (at.Q1[:, 2, b, None] - depth1 * y[b]) for b in range(2)]
         dz = [depth2 * (at.Q2[:, 2, b, None] - depth2 * z[b]) for b in range(2)]
         squared = c * c
-        J[:, 5] = gain * (z[0] * dy[1] - z[1] * dy[0])
-        J[:, 5] -= (y[0] * dy[0] + y[1] * dy[1]) * bend2 - (z[0] * z[0] + z[1] * z[1] - squared) * bend1
-        J[:, 6] = gain * (dz[0] * y[1] - dz[1] * y[0])
-        J[:, 6] -= (z[0] * dz[0] + z[1] * dz[1]) * bend1 - (y[0] * y[0] + y[1] * y[1] - squared) * bend2
+        J[:, 5] = gain * (z[0] * dy[1] - z[1] * dy[0]) - (y[0] * dy[0] + y[1] * dy[1]) * bend2
+        J[:, 6] = gain * (dz[0] * y[1] - dz[1] * y[0]) - (z[0] * dz[0] + z[1] * dz[1]) * bend1
+        if at.radial_gains is not None:
+            J[:, 7] = at.radial_gains[0] * J[:, 5] + at.radial_gains[1] * J[:, 6]
+        # A longer focal length reduces the angle of a pixel, too.
+        J[:, 5] += (z[0] * z[0] + z[1] * z[1] - squared) * bend1
+        J[:, 6] += (y[0] * y[0] + y[1] * y[1] - squared) * bend2
     J[:, -1] = at.r * weights
     return J

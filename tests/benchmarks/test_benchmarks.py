@@ -10,7 +10,7 @@ from epipolar_scenes import pixel_scene
 from colmap_vg import read_view_graph, solve_view_graph
 from colmap_vg.calibration.self_calibration import estimate_focal_lengths
 from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient, gauged
-from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.pose_graph.alternation import solve_joint
@@ -58,7 +58,7 @@ def matched_ring():
         np.array([1000.0]),
         np.zeros(1, dtype=bool),
     )
-    return problem, Cameras(so3.exp(1e-3 * rng.standard_normal((50, 3))) @ R, p, np.zeros(1))
+    return problem, Cameras(so3.exp(1e-3 * rng.standard_normal((50, 3))) @ R, p, Lenses(np.zeros(1)))
 
 
 def test_reading_a_database(benchmark, street):

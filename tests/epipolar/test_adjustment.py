@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient, gauged
-from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.epipolar.triplets import find_triplets
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
@@ -43,7 +43,7 @@ def scene(seed, *, num_images=8, num_matches=40, sigma_px=0.0, focal=1000.0, wro
 
 
 def directions_of(problem, R, p):
-    return Cameras(R, p, np.zeros(2)).relative(problem.edges)[1]
+    return Cameras(R, p, Lenses(np.zeros(2))).relative(problem.edges)[1]
 
 
 def with_triplets(problem, R, p, points, *, sigma_px=0.0, seed=0):
@@ -67,16 +67,18 @@ def disturbed(R, p, seed, amount):
 
 
 @pytest.mark.parametrize("shared", [False, True])
-@pytest.mark.parametrize("free", [False, True])
-def test_gradient_is_that_of_finite_differences(free, shared):
+@pytest.mark.parametrize(("free", "term"), [(False, None), (True, None), (True, 0.0), (True, -0.2), (True, 0.1)])
+def test_gradient_is_that_of_finite_differences(free, term, shared):
     problem, R, p = scene(1, sigma_px=1.0, free=free)
+    if term is not None:
+        problem = replace(problem, bent_cameras=np.array([True, False]))
     if shared:
         points = np.random.default_rng(3).uniform(-0.3, 0.3, (25, 3))
         problem = with_triplets(problem, R, p, points, sigma_px=1.0)
         assert len(problem.triplets.images) > len(R)
     R, p = disturbed(R, p, 2, 0.02)
-    at = Cameras(R, gauged(p), np.array([0.05, -0.03]) if free else np.zeros(2))
-    size = 6 * len(R) + (2 if free else 0)
+    at = Cameras(R, gauged(p), Lenses(np.array([0.05, -0.03]) if free else np.zeros(2), term or 0.0))
+    size = 6 * len(R) + (2 if free else 0) + (term is not None)
     _, gradient = cost_and_gradient(problem, at, 3.0)
     assert gradient.shape == (size,)
     rng = np.random.default_rng(0)
@@ -226,7 +228,7 @@ def line_of_cameras(*, sigma_px):
 
 def test_triplets_fix_the_ratios_of_baselines_on_a_line():
     problem, R, p, bent = line_of_cameras(sigma_px=0.3)
-    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
+    directions = Cameras(R, p, Lenses(np.zeros(1))).relative(problem.edges)[1]
     found = adjust_epipolar(problem, R, bent, directions)
     without = adjust_epipolar(replace(problem, triplets=None), R, bent, directions)
     with_error, without_error = (align_positions(f.projection_centers, p)[0].max() for f in (found, without))
@@ -241,14 +243,14 @@ def test_triplets_fix_the_ratios_of_baselines_on_a_line():
 def test_triplets_of_coinciding_cameras_keep_everything_finite():
     problem, R, p, bent = line_of_cameras(sigma_px=0.3)
     bent[1] = bent[0]
-    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
-    cost, gradient = cost_and_gradient(problem, Cameras(R, bent, np.zeros(1)), 2.0)
+    directions = Cameras(R, p, Lenses(np.zeros(1))).relative(problem.edges)[1]
+    cost, gradient = cost_and_gradient(problem, Cameras(R, bent, Lenses(np.zeros(1))), 2.0)
     assert np.isfinite(cost)
     assert np.isfinite(gradient).all()
     # A direction over a distance of nothing would pull a million times harder than those of cameras apart.
     apart = bent.copy()
     apart[1, 0] += 0.2
-    usual = cost_and_gradient(problem, Cameras(R, apart, np.zeros(1)), 2.0)[1]
+    usual = cost_and_gradient(problem, Cameras(R, apart, Lenses(np.zeros(1))), 2.0)[1]
     assert np.abs(gradient).max() < 100.0 * np.abs(usual).max()
     assert np.isfinite(adjust_epipolar(problem, R, bent, directions).projection_centers).all()
 
@@ -299,7 +301,7 @@ def test_focal_lengths_that_the_matches_do_not_tell_are_held():
 
 def test_no_image_jumps_past_its_neighbours_in_one_step():
     problem, R, p = scene(4)
-    cameras = Cameras(R, p, np.zeros(2))
+    cameras = Cameras(R, p, Lenses(np.zeros(2)))
     reach = cameras.reach(problem.edges)
     length = np.linalg.norm(p[problem.edges[:, 1]] - p[problem.edges[:, 0]], axis=1)
     nearest = [length[(problem.edges == image).any(axis=1)].min() for image in range(len(p))]

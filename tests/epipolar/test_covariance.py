@@ -8,6 +8,7 @@ from image_sets import image_set
 
 from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar
 from colmap_vg.epipolar.covariance import camera_covariances
+from colmap_vg.epipolar.problem import Lenses
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.similarity import align_positions
 
@@ -15,7 +16,7 @@ LAYOUTS = ("ring", "street", "grid")
 
 
 def adjusted(problem, R, p):
-    return adjust_epipolar(problem, R, p, Cameras(R, p, np.zeros(1)).relative(problem.edges)[1])
+    return adjust_epipolar(problem, R, p, Cameras(R, p, Lenses(np.zeros(1))).relative(problem.edges)[1])
 
 
 def normalized_errors(problem, R, p):

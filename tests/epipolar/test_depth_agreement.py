@@ -41,11 +41,12 @@ class Scene:
     def noisy(x, sigma, rng):
         return normalized(x + sigma * np.einsum("kab,kb->ka", tangent_basis(x), rng.standard_normal((len(x), 2))))
 
-    def rays(self, log_focals=(0.0, 0.0, 0.0)):
+    def rays(self, log_focals=(0.0, 0.0, 0.0), *, free=False):
         grown = np.exp(np.asarray(log_focals))
         bearings = normalized(self.bearings / np.stack([grown, grown, np.ones(3)], axis=1)[:, None])
         columns = list(bearings.transpose(0, 2, 1).reshape(9, -1))
-        return TripletRays(Pieces.cut(self.offsets, columns), np.tile((FOCALS * grown)[:, None] ** -2.0, 3))
+        ratios = np.ones((3, 3)) if free else None
+        return TripletRays(Pieces.cut(self.offsets, columns), np.tile((FOCALS * grown)[:, None] ** -2.0, 3), ratios)
 
     def poses(self, step=None):
         step = np.zeros(12) if step is None else step
@@ -96,7 +97,7 @@ def test_derivatives_are_those_of_finite_differences(unknown):
     scene = Scene(3, sigma_px=3.0)
     step = np.zeros(15)
     step[unknown] = 1e-6
-    at = depth_equations(scene.rays(), scene.poses(), 2.0, with_focals=True)
+    at = depth_equations(scene.rays(free=True), scene.poses(), 2.0)
     ahead, behind = (depth_costs(scene.rays(sign * step[12:]), scene.poses(sign * step[:12]), 2.0) for sign in (1, -1))
     np.testing.assert_allclose(at.costs, depth_costs(scene.rays(), scene.poses(), 2.0), rtol=1e-12)
     np.testing.assert_allclose(
@@ -114,7 +115,7 @@ def test_derivatives_are_those_of_finite_differences(unknown):
 
 def test_equations_without_focals_are_a_part_of_those_with_them():
     scene = Scene(4, sigma_px=1.0)
-    few, all_of_them = (depth_equations(scene.rays(), scene.poses(), 1.0, with_focals=w) for w in (False, True))
+    few, all_of_them = (depth_equations(scene.rays(free=w), scene.poses(), 1.0) for w in (False, True))
     np.testing.assert_allclose(few.gradients, all_of_them.gradients[:, :12], rtol=1e-12)
     np.testing.assert_allclose(few.hessians, all_of_them.hessians[:, :12, :12], rtol=1e-12, atol=1e-12)
 
@@ -129,7 +130,7 @@ def test_points_on_a_baseline_say_nothing():
     scene = Scene(6)
     scene.bearings[1, 0] = scene.bearings[0, 0] = normalized(scene.baselines[0, 0])
     poses = TripletPoses(np.tile(np.eye(3), (2, 3, 1, 1)), scene.baselines)
-    at = depth_equations(scene.rays(), poses, 1.0, with_focals=True)
+    at = depth_equations(scene.rays(free=True), poses, 1.0)
     assert np.isfinite(at.gradients).all()
     assert np.isfinite(at.hessians).all()
     assert abs(depth_residuals(scene.rays(), poses)[0]) < 1e-2

@@ -6,9 +6,9 @@ import pytest
 from colmap_vg.epipolar.normal_system import MIN_DAMPING, CameraTerms, NormalSystem
 
 
-def random_terms(images, rng, *, with_focals):
+def random_terms(images, rng, *, with_focals, with_radial):
     q, s = images.shape
-    J = rng.standard_normal((q, 40, 6 * s + s))
+    J = rng.standard_normal((q, 40, 6 * s + s + with_radial))
     r = rng.standard_normal((q, 40))
     gradients, hessians = np.einsum("qka,qk->qa", J, r), np.einsum("qka,qkb->qab", J, J)
     p = 6 * s
@@ -18,24 +18,25 @@ def random_terms(images, rng, *, with_focals):
     return CameraTerms.chained(images, (r**2).sum(axis=1), gradients, hessians, chain)
 
 
-@pytest.mark.parametrize("free", [[], [1], [0, 2]])
-def test_step_and_gradient_are_those_of_dense_matrices(free):
+@pytest.mark.parametrize(("free", "radial"), [([], False), ([1], False), ([0, 2], False), ([0, 2], True)])
+def test_step_and_gradient_are_those_of_dense_matrices(free, radial):
     rng = np.random.default_rng(0)
     n, camera, free = 7, np.array([0, 1, 2, 0, 1, 2, 1]), np.array(free, dtype=int)
     pairs = np.array([[0, 1], [2, 1], [2, 3], [3, 4], [5, 4], [6, 5], [0, 6], [1, 0]])
     triplets = np.array([[0, 1, 2], [3, 2, 1], [6, 0, 3], [5, 4, 3]])
-    terms = [random_terms(images, rng, with_focals=len(free) > 0) for images in (pairs, triplets)]
-    system = NormalSystem(n, [pairs, triplets], camera, free, 3)
-    size = 6 * n + len(free)
+    terms = [random_terms(images, rng, with_focals=len(free) > 0, with_radial=radial) for images in (pairs, triplets)]
+    system = NormalSystem(n, [pairs, triplets], camera, free, 3, with_radial=radial)
+    size = 6 * n + len(free) + radial
     H, g = np.zeros((size, size)), np.zeros(size)
     for term in terms:
         for k, images in enumerate(term.images):
             place = [6 * i + a for i in images for a in range(6)]
             slots = [6 * n + list(free).index(camera[i]) if camera[i] in free else -1 for i in images]
+            slots = [*slots, size - 1] if radial else slots[: term.lens_gradients.shape[1]]
             whole = np.block(
-                [[term.pose_blocks[k], term.cross_blocks[k]], [term.cross_blocks[k].T, term.focal_blocks[k]]]
+                [[term.pose_blocks[k], term.cross_blocks[k]], [term.cross_blocks[k].T, term.lens_blocks[k]]]
             )
-            local = np.concatenate([term.pose_gradients[k], term.focal_gradients[k]])
+            local = np.concatenate([term.pose_gradients[k], term.lens_gradients[k]])
             for a, row in enumerate(place + slots):
                 for b, column in enumerate(place + slots):
                     if row >= 0 and column >= 0:
@@ -63,7 +64,7 @@ def test_chain_carries_derivatives_to_cameras():
         full = whole.T @ hessians[k] @ whole
         np.testing.assert_allclose(term.pose_blocks[k], full[:18, :18])
         np.testing.assert_allclose(term.cross_blocks[k], full[:18, 18:])
-        np.testing.assert_allclose(term.focal_blocks[k], full[18:, 18:])
+        np.testing.assert_allclose(term.lens_blocks[k], full[18:, 18:])
         np.testing.assert_allclose(
-            np.concatenate([term.pose_gradients[k], term.focal_gradients[k]]), gradients[k] @ whole
+            np.concatenate([term.pose_gradients[k], term.lens_gradients[k]]), gradients[k] @ whole
         )

@@ -1,4 +1,4 @@
-"""A radial term: taken out of rays exactly, found where it is and only there, and carried to the camera."""
+"""A radial term: taken out of rays exactly, with its derivative; found where it is, and carried to the camera."""
 
 from dataclasses import replace
 
@@ -10,9 +10,10 @@ from image_sets import FOCAL, image_set
 from colmap_vg import align_positions
 from colmap_vg.colmap_io.cameras import has_radial_term, with_radial_term
 from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar
-from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.epipolar.radial_term import fit_radial_term
 from colmap_vg.geometry.directions import normalized
+from colmap_vg.two_view.radial_distortion import undistorted_rays
 
 ALL = np.array([True])
 
@@ -35,33 +36,48 @@ def bent(problem: EpipolarProblem, term: float) -> EpipolarProblem:
     )
 
 
+def padded(rays: np.ndarray) -> np.ndarray:
+    """Rays (k, 3) as two pieces with padding."""
+    return np.stack([np.pad(half.T, ((0, 0), (0, 3))) for half in np.array_split(rays[: len(rays) // 2 * 2], 2)])
+
+
 @pytest.mark.parametrize("term", [-0.2, 0.15])
-def test_a_term_is_taken_out_exactly(term: float) -> None:
-    problem, _, _ = image_set(0, "ring", 8, 300, 0.5)
-    straight = bent(problem, term).undistorted(term, ALL)
-    np.testing.assert_allclose(straight.bearings1, problem.bearings1, atol=1e-9)
-    np.testing.assert_allclose(straight.triplets.bearings, problem.triplets.bearings, atol=1e-9)
-    same = problem.undistorted(term, ~ALL)
-    np.testing.assert_allclose(same.bearings2, problem.bearings2, atol=1e-15)
+def test_a_term_is_taken_out_exactly_where_a_camera_has_it(term: float) -> None:
+    rays = padded(image_set(0, "ring", 8, 300, 0.5)[0].bearings1)
+    bent = np.stack([np.pad(shown(piece[:, :-3].T, term).T, ((0, 0), (0, 3))) for piece in rays])
+    straight, _ = undistorted_rays(bent, term, np.array([True, False]))
+    np.testing.assert_allclose(straight[0], rays[0], atol=1e-9)
+    np.testing.assert_allclose(straight[1], bent[1], atol=1e-15)
+
+
+@pytest.mark.parametrize("term", [-0.2, 0.0, 0.15])
+def test_gains_are_shifts_by_the_term_over_those_by_the_focal_length(term: float) -> None:
+    rays, all_of_them = padded(image_set(0, "ring", 8, 300, 0.5)[0].bearings1), np.ones(2, dtype=bool)
+    (ahead, _), (behind, _), (straight, gains) = (
+        undistorted_rays(rays, term + step, all_of_them) for step in (1e-5, -1e-5, 0.0)
+    )
+    z = straight[:, 2:]
+    by_focal = z * (np.array([0.0, 0.0, 1.0])[:, None] - z * straight)
+    np.testing.assert_allclose((ahead - behind) / 2e-5, gains[:, None] * by_focal, atol=1e-7)
 
 
 def test_rays_off_the_axis_and_beyond_a_maximum_stay_finite() -> None:
-    problem, _, _ = image_set(0, "ring", 4, 100, 0.5)
-    wide = problem.bearings1.copy()
-    wide[:3] = normalized(np.array([[1.0, 0.0, -0.2], [2.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
-    straight = replace(problem, bearings1=wide).undistorted(-0.5, ALL).bearings1
+    wide = normalized(np.array([[1.0, 0.0, -0.2], [2.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.1]]))
+    straight, gains = undistorted_rays(wide.T[None], -0.5, np.array([True]))
     assert np.isfinite(straight).all()
-    np.testing.assert_allclose(straight[[0, 2]], wide[[0, 2]])
+    assert np.isfinite(gains).all()
+    np.testing.assert_allclose(straight[0].T[[0, 2, 3]], wide[[0, 2, 3]])
+    np.testing.assert_array_equal(gains[0, [0, 1, 2, 3]], 0.0)
 
 
 def test_the_term_of_a_bent_lens_is_found_with_its_focal_length_and_positions() -> None:
     problem, R, p = image_set(2, "street", 16, 2500, 0.3, free=True)
     curved = bent(problem, -0.1)
-    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
+    directions = Cameras(R, p, Lenses(np.zeros(1))).relative(problem.edges)[1]
     without = adjust_epipolar(curved, R, p, directions)
     found = fit_radial_term(curved, without, ALL)
     assert found is not None
-    assert abs(found.radial_term + 0.1) < 0.01
+    assert abs(found.result.radial_term + 0.1) < 0.01
     assert abs(np.log(found.result.focal_scales[0])) < 0.01
     error, before = (align_positions(r.projection_centers, p)[0].mean() for r in (found.result, without))
     assert error < 0.1 * before
@@ -69,7 +85,7 @@ def test_the_term_of_a_bent_lens_is_found_with_its_focal_length_and_positions() 
 
 def test_a_straight_lens_gets_none() -> None:
     problem, R, p = image_set(3, "ring", 12, 600, 0.5, free=True)
-    directions = Cameras(R, p, np.zeros(1)).relative(problem.edges)[1]
+    directions = Cameras(R, p, Lenses(np.zeros(1))).relative(problem.edges)[1]
     assert fit_radial_term(problem, adjust_epipolar(problem, R, p, directions), ALL) is None
 
 

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from colmap_vg.epipolar.adjustment import Cameras, gauged
-from colmap_vg.epipolar.problem import EpipolarProblem
+from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.epipolar.triplets import find_triplets
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.simulation.ring_scenes import look_at, ring_cameras
@@ -56,9 +56,9 @@ def image_set(seed: int, layout, n: int, num_points: int, sigma_px: float, wrong
                 second.append(np.where(rng.random(len(shared)) < wrong, other, shared))
     problem = _problem(np.array(edges), first, second, rays, R, n, free)
     if wrong > 0:
-        cameras = Cameras(R, gauged(p), np.zeros(1))
+        cameras = Cameras(R, gauged(p), Lenses(np.zeros(1)))
         relative, direction, _ = cameras.relative(problem.edges)
-        near = np.abs(residuals(problem.matches(np.zeros(1)), relative, direction)) < 4.0
+        near = np.abs(residuals(problem.matches(cameras.lenses), relative, direction)) < 4.0
         kept = np.split(near, problem.offsets[1:-1])
         first = [a[k] for a, k in zip(first, kept, strict=True)]
         second = [b[k] for b, k in zip(second, kept, strict=True)]

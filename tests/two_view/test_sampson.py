@@ -1,5 +1,7 @@
 """Sampson residuals against the essential matrix's formula, and their derivatives by poses and keypoints."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matched_rays import matched_rays
@@ -12,8 +14,17 @@ from colmap_vg.two_view.sampson_errors import sampson_errors
 FOCALS1, FOCALS2 = np.array([900.0, 800.0, 700.0]), np.array([400.0, 500.0, 600.0])
 
 
-def matches_of(data, *, focals1=FOCALS1, focals2=FOCALS2):
-    return sampson.Matches.of_rays(data.offsets, data.bearings1, data.bearings2, focals1**-2.0, focals2**-2.0)
+def matches_of(data, unknowns=0):
+    """Matches with no, two or three lens unknowns."""
+    m = len(data.rotations)
+    variances = FOCALS1[:m] ** -2.0, FOCALS2[:m] ** -2.0
+    matches = sampson.Matches.of_rays(data.offsets, data.bearings1, data.bearings2, *variances)
+    pieces = matches.pieces
+    return replace(
+        matches,
+        focal_ratios=np.ones((2, m)) if unknowns else None,
+        radial_gains=np.full((len(pieces.columns), 2, pieces.columns.shape[2]), 0.3) if unknowns == 3 else None,
+    )
 
 
 def test_residuals_are_those_of_the_essential_matrix():
@@ -27,14 +38,15 @@ def test_residuals_are_those_of_the_essential_matrix():
     assert costs[2] == pytest.approx(9.0 * np.log1p(np.square(expected[40:] / 3.0)).sum())
 
 
-@pytest.mark.parametrize("with_focals", [False, True])
-def test_normal_equations_are_sums_over_the_derivatives_of_residuals(with_focals):
+@pytest.mark.parametrize("unknowns", [0, 2, 3])
+def test_normal_equations_are_sums_over_the_derivatives_of_residuals(unknowns):
     data = matched_rays(1, [30, 70, 260], sigma=0.01)
-    matches, scales = matches_of(data), np.array([1.0, 4.0, 9.0])
-    found = sampson.normal_equations(matches, data.rotations, data.directions, scales, with_focals=with_focals)
-    parts = list(sampson.derivatives_by_block(matches, data.rotations, data.directions, with_focals=with_focals))
+    matches, scales = matches_of(data, unknowns), np.array([1.0, 4.0, 9.0])
+    found = sampson.normal_equations(matches, data.rotations, data.directions, scales)
+    parts = list(sampson.derivatives_by_block(matches, data.rotations, data.directions))
     r = np.concatenate([part.r for *_, part in parts])
     J = np.concatenate([part.by_pose for *_, part in parts], axis=1)
+    assert len(J) == 5 + unknowns
     for k in range(3):
         rows = slice(data.offsets[k], data.offsets[k + 1])
         ratio = np.square(r[rows] / scales[k])
@@ -62,7 +74,7 @@ def test_shrinks_are_those_of_rays_of_longer_focal_lengths():
 
 def test_derivatives_by_keypoints_are_those_of_finite_differences():
     data = matched_rays(3, [30, 70], sigma=0.002)
-    matches = matches_of(data, focals1=FOCALS1[:2], focals2=FOCALS2[:2])
+    matches = matches_of(data)
     parts = list(sampson.derivatives_by_block(matches, data.rotations, data.directions))
     by_rays = [np.concatenate([getattr(part, name) for *_, part in parts], axis=1) for name in ("by_ray1", "by_ray2")]
     np.testing.assert_allclose(sum(np.square(b).sum(axis=0) for b in by_rays), 1.0, rtol=1e-9)
