@@ -106,7 +106,7 @@ def build_model(
             cache,
             options,
             log,
-            lambda changed: _adjust(mapper, changed, max_num_iterations=20, function_tolerance=1e-5),
+            lambda changed: _adjust(mapper, changed),
         )
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
@@ -118,7 +118,7 @@ def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: Mappin
     """Alternate bundle adjustment and retriangulation; return whether they converged in `MAX_NUM_ROUNDS` rounds."""
     triangulator = triangulator_options(options)
     lenses = _focal_lengths(mapper.reconstruction)
-    cost_ratio, enough = _adjust(mapper, options, max_num_iterations=15, function_tolerance=5e-4), GOOD_START_COST_RATIO
+    cost_ratio, enough = _adjust(mapper, options), GOOD_START_COST_RATIO
     for _ in range(MAX_NUM_ROUNDS):
         before, lenses = lenses, _focal_lengths(mapper.reconstruction)
         mapper.complete_and_merge_tracks(triangulator)
@@ -126,7 +126,7 @@ def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: Mappin
         _filter(mapper)
         if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
             return True
-        cost_ratio = _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-5)
+        cost_ratio = _adjust(mapper, options)
         enough = CONVERGED_COST_RATIO
     return False
 
@@ -147,7 +147,7 @@ def _register_remaining(
     added -= misplaced
     if added or removed or misplaced:
         mapper.complete_and_merge_tracks(triangulator_options(options))
-        _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-4)
+        _adjust(mapper, options)
         again = _remove_unsupported(mapper)
         removed, added = removed | again, added - again
     log.result(f"{len(added)} images added, {len(removed)} removed")
@@ -172,19 +172,15 @@ def adjust_once_more(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    share = _adjust(mapper, options, max_num_iterations=20, function_tolerance=1e-4)
+    share = _adjust(mapper, options)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return share
 
 
-def _adjust(
-    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, max_num_iterations: int, function_tolerance: float
-) -> float:
+def _adjust(mapper: "pycolmap.IncrementalMapper", options: MappingOptions) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
-    cost_ratio = adjust_bundle(
-        mapper.reconstruction, options, max_num_iterations=max_num_iterations, function_tolerance=function_tolerance
-    )
+    cost_ratio = adjust_bundle(mapper.reconstruction, options)
     _filter(mapper)
     return cost_ratio
 

@@ -3,7 +3,7 @@
 import pycolmap
 import pytest
 
-from colmap_vg.mapping.options import bundle_options, mapper_options, triangulator_options
+from colmap_vg.mapping.options import MAX_NUM_STEPS, TOLERANCE, bundle_options, mapper_options, triangulator_options
 from colmap_vg.options import MappingOptions
 
 
@@ -16,7 +16,7 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
         num_threads=3,
         random_seed=7,
     )
-    bundle = bundle_options(options, loss_scale_px=0.7, max_num_iterations=11, function_tolerance=1e-4)
+    bundle = bundle_options(options, loss_scale_px=0.7)
     assert (bundle.refine_focal_length, bundle.refine_principal_point) == (switch, not switch)
     assert bundle.refine_extra_params == switch
     assert bundle.min_track_length == 3
@@ -24,7 +24,8 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
     assert bundle.ceres.loss_function_type == pycolmap.LossFunctionType.CAUCHY
     assert bundle.ceres.loss_function_scale == 0.7
     solver = bundle.ceres.solver_options
-    assert (solver.max_num_iterations, solver.function_tolerance, solver.num_threads) == (11, 1e-4, 3)
+    assert (solver.max_num_iterations, solver.function_tolerance) == (MAX_NUM_STEPS, TOLERANCE)
+    assert (solver.use_inner_iterations, solver.num_threads) == (True, 3)
     mapper = mapper_options(options)
     assert (mapper.abs_pose_refine_focal_length, mapper.abs_pose_refine_extra_params) == (switch, switch)
     assert (mapper.num_threads, mapper.random_seed) == (3, 7)

@@ -1,0 +1,69 @@
+"""The scale of the robust loss: wide under normal noise, narrow under heavy tails, and of the least variance."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_vg.linear.robust_losses import cauchy_weight
+from colmap_vg.mapping.observations import MIN_SIGMA_PX, SCALES_IN_SIGMAS, Observations, loss_scale, variances
+
+
+def model(noise_px: float = 0.0, heavy: bool = False, num_points: int = 400) -> pycolmap.Reconstruction:
+    """A synthetic model; keypoints with normal noise, or with that of Student's t of two degrees of freedom."""
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=8, num_points3D=num_points, num_points2D_without_point3D=0
+    )
+    pycolmap.set_random_seed(0)
+    found = pycolmap.synthesize_dataset(options)
+    rng = np.random.default_rng(0)
+    for image in found.images.values():
+        for point in image.points2D:
+            noise = rng.standard_normal(2) / (np.sqrt(rng.chisquare(2.0) / 2.0) if heavy else 1.0)
+            point.xy = point.xy + noise_px * noise
+    return found
+
+
+def test_observations_are_those_of_the_points() -> None:
+    found = model(noise_px=2.0)
+    points = [found.points3D[i] for i in sorted(found.points3D)[:5]]
+    seen = Observations.of(found, points)
+    errors = seen.reprojection_errors(found)
+    row = 0
+    for number, point in enumerate(points):
+        for element in point.track.elements:
+            image = found.image(element.image_id)
+            assert seen.point_row[row] == number
+            assert seen.images[seen.image_row[row]].image_id == element.image_id
+            assert seen.camera_ids[row] == image.camera_id
+            offset = image.project_point(point.xyz) - image.point2D(element.point2D_idx).xy
+            assert errors[row] == pytest.approx(np.linalg.norm(offset), rel=1e-9)
+            row += 1
+    assert row == len(errors)
+
+
+@pytest.mark.parametrize("noise_px", [0.3, 2.0])
+def test_normal_noise_has_nearly_squares_and_heavy_tails_have_not(noise_px: float) -> None:
+    sigma = noise_px
+    assert loss_scale(model(noise_px), 3) > 6.0 * sigma
+    heavy = loss_scale(model(noise_px, heavy=True), 3)
+    assert 0.8 * sigma < heavy < 3.0 * sigma
+    assert loss_scale(model(2.0 * noise_px, heavy=True), 3) == pytest.approx(2.0 * heavy, rel=0.01)
+
+
+def test_exact_keypoints_and_no_points_have_a_finite_scale() -> None:
+    found = model()
+    assert 0.0 < loss_scale(found, 3) <= SCALES_IN_SIGMAS[-1] * MIN_SIGMA_PX
+    assert loss_scale(found, 1000) > 0.0
+
+
+def test_variances_are_those_of_estimates() -> None:
+    # The position of 40 two-dimensional deviates of Student's t, fitted many times.
+    rng = np.random.default_rng(1)
+    r = rng.standard_normal((4000, 40, 2)) / np.sqrt(rng.chisquare(3.0, (4000, 40, 1)) / 3.0)
+    for scale in (1.0, 4.0):
+        at = np.zeros((4000, 1, 2))
+        for _ in range(60):
+            weights = cauchy_weight(np.sum((r - at) ** 2, axis=2) / scale**2)[:, :, None]
+            at = (weights * r).sum(axis=1, keepdims=True) / weights.sum(axis=1, keepdims=True)
+        expected = variances(np.sum(r**2, axis=2).ravel(), np.array([scale]))[0]
+        assert 40 * np.var(at, axis=0).mean() == pytest.approx(expected, rel=0.1)
