@@ -161,9 +161,21 @@ def _focal_lengths(reconstruction: "pycolmap.Reconstruction") -> NDArray[np.floa
 
 
 def adjust_once_more(
-    cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", options: MappingOptions
+    cache: "pycolmap.DatabaseCache",
+    reconstruction: "pycolmap.Reconstruction",
+    options: MappingOptions,
+    *,
+    trial: bool = False,
 ) -> float:
     """Run one more round of bundle adjustment on a finished model, in place.
+
+    Parameters
+    ----------
+    cache : pycolmap.DatabaseCache
+    reconstruction : pycolmap.Reconstruction
+    options : MappingOptions
+    trial : bool
+        Only the cost is asked for: the adjustment ends early.
 
     Returns
     -------
@@ -172,15 +184,15 @@ def adjust_once_more(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    share = _adjust(mapper, options)
+    share = _adjust(mapper, options, trial=trial)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return share
 
 
-def _adjust(mapper: "pycolmap.IncrementalMapper", options: MappingOptions) -> float:
+def _adjust(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, trial: bool = False) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
-    cost_ratio = adjust_bundle(mapper.reconstruction, options)
+    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial)
     _filter(mapper)
     return cost_ratio
 

@@ -15,13 +15,15 @@ from colmap_vg.mapping.point_refinement import refine_points
 from colmap_vg.options import MappingOptions
 
 
-def adjust_bundle(reconstruction: "pycolmap.Reconstruction", options: MappingOptions) -> float:
+def adjust_bundle(reconstruction: "pycolmap.Reconstruction", options: MappingOptions, *, trial: bool = False) -> float:
     """Adjust cameras and points, in place.
 
     Parameters
     ----------
     reconstruction : pycolmap.Reconstruction
     options : MappingOptions
+    trial : bool
+        Only the cost is asked for: the adjustment ends early.
 
     Returns
     -------
@@ -29,7 +31,7 @@ def adjust_bundle(reconstruction: "pycolmap.Reconstruction", options: MappingOpt
         Ratio of the final to the initial cost; 1 without observations.
     """
     scale = loss_scale(reconstruction, MIN_TRACK_LENGTH)
-    bundle = bundle_options(options, loss_scale_px=scale)
+    bundle = bundle_options(options, loss_scale_px=scale, trial=trial)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
         config.add_image(image_id)

@@ -3,7 +3,14 @@
 import pycolmap
 import pytest
 
-from colmap_vg.mapping.options import MAX_NUM_STEPS, TOLERANCE, bundle_options, mapper_options, triangulator_options
+from colmap_vg.mapping.options import (
+    MAX_NUM_STEPS,
+    TOLERANCE,
+    TRIAL_TOLERANCE,
+    bundle_options,
+    mapper_options,
+    triangulator_options,
+)
 from colmap_vg.options import MappingOptions
 
 
@@ -26,6 +33,8 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
     solver = bundle.ceres.solver_options
     assert (solver.max_num_iterations, solver.function_tolerance) == (MAX_NUM_STEPS, TOLERANCE)
     assert (solver.use_inner_iterations, solver.num_threads) == (True, 3)
+    solver = bundle_options(options, loss_scale_px=0.7, trial=True).ceres.solver_options
+    assert (solver.use_inner_iterations, solver.function_tolerance) == (False, TRIAL_TOLERANCE)
     mapper = mapper_options(options)
     assert (mapper.abs_pose_refine_focal_length, mapper.abs_pose_refine_extra_params) == (switch, switch)
     assert (mapper.num_threads, mapper.random_seed) == (3, 7)
