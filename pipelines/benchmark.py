@@ -20,10 +20,10 @@ from typing import Any, get_args
 
 import numpy as np
 from benchmark.growth import Timing, growth_table, looped_scene, timed_rotation_averaging, timed_solve
-from benchmark.mapper_runs import MAPPERS, MapperRun, alternate, compared
+from benchmark.mapper_runs import MAPPERS, MapperRun, alternate, compared, summarized
 from benchmark.photograph_runs import WAYS, PhotographRun, alternate_ways, compared_ways
 from paper.markdown import markdown_table
-from paper.plots import growth_svg
+from paper.plots import growth_svg, ratios_svg
 from paper.scenes import set_conditions, simulated_scene, topology_sets
 
 import colmap_vg
@@ -52,6 +52,9 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", help="of the topology; default: all")
     parser.add_argument("--layouts", nargs="+", choices=["street", "ring", "drone"], default=["street", "drone"])
     parser.add_argument("--sizes", type=int, nargs="+", help="images of synthetic databases, or to render")
+    parser.add_argument(
+        "--noises", type=float, nargs="+", default=[0.5], help="of synthetic keypoints, px, for mapping"
+    )
     parser.add_argument("--edges", type=int, nargs="*", help="edges of synthetic graphs, for growth")
     parser.add_argument("--quick", action="store_true", help="small problems; fails by ratios only")
     arguments = parser.parse_args()
@@ -86,8 +89,14 @@ def mapping(arguments: argparse.Namespace) -> Result:
         folders = arguments.databases
         if not folders:
             sizes = arguments.sizes or ([QUICK_IMAGES[-1]] if arguments.quick else [500])
-            folders = [synthetic_folder(Path(name), layout, size) for layout in arguments.layouts for size in sizes]
+            folders = [
+                synthetic_folder(Path(name), layout, size, noise)
+                for layout in arguments.layouts
+                for size in sizes
+                for noise in arguments.noises
+            ]
         text, data, failed = "", {}, []
+        every: dict[str, list[MapperRun]] = {}
         for folder in folders:
             truth = folder / "ground_truth.txt"
             runs = alternate(
@@ -95,9 +104,12 @@ def mapping(arguments: argparse.Namespace) -> Result:
             )
             text += f"## {folder.name}\n\n{compared(runs)}\n"
             data[folder.name] = [asdict(run) for run in runs]
+            every[folder.name] = runs
             if arguments.quick:
                 failed += falls_behind(folder.name, runs)
-    return text, data, {}, failed
+    summary, ratios = summarized(every)
+    plots = {"ratios": ratios_svg("Ours over the better mapper of COLMAP", "ratio", ratios)} if ratios else {}
+    return f"{summary}\n{text}", data, plots, failed
 
 
 def falls_behind(name: str, runs: list[MapperRun]) -> list[str]:
@@ -140,7 +152,7 @@ def growth(arguments: argparse.Namespace) -> Result:
     for layout in arguments.layouts:
         for size in sizes:
             with tempfile.TemporaryDirectory() as name:
-                folder = synthetic_folder(Path(name), layout, size)
+                folder = synthetic_folder(Path(name), layout, size, 0.5)
                 for run in alternate(folder / "database.db", folder / "ground_truth.txt", arguments.mappers, 1, show):
                     key = f"{layout} {run.mapper}"
                     series.setdefault(key, []).append(Timing(key, size, run.seconds))
@@ -194,12 +206,12 @@ def plotted(title: str, label: str, series: dict[str, list[Timing]]) -> str:
     )
 
 
-def synthetic_folder(parent: Path, layout: Any, size: int) -> Path:
+def synthetic_folder(parent: Path, layout: Any, size: int, noise_px: float) -> Path:
     """A folder with database.db and ground_truth.txt of synthetic views."""
-    folder = parent / f"{layout}-{size}"
+    folder = parent / f"{layout}-{size}-{noise_px:g}px"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    views = synthetic_views(layout, size)
+    views = synthetic_views(layout, size, noise_px=noise_px)
     write_synthetic_database(folder / "database.db", views)
     (folder / "ground_truth.txt").write_text(truth_text(views))
     return folder

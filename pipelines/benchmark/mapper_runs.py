@@ -4,7 +4,7 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -180,6 +180,55 @@ def compared(runs: Sequence[MapperRun]) -> str:
         ]
         text += "\n" + markdown_table(["stage of ours", "seconds", "peak MiB so far"], stages)
     return text
+
+
+def summarized(runs: Mapping[str, Sequence[MapperRun]]) -> tuple[str, dict[str, dict[str, float]]]:
+    """Ratios of ours to COLMAP's mappers on several databases, with their geometric means.
+
+    The error is compared with the lower one of the mappers that registered most images.
+
+    Parameters
+    ----------
+    runs : mapping of str to sequence of MapperRun
+        By database, from :func:`alternate`.
+
+    Returns
+    -------
+    text : str
+        Markdown; empty without ours or without others.
+    ratios : dict of str to dict of str to float
+        By kind of ratio, then by database.
+    """
+    ratios: dict[str, dict[str, float]] = {}
+    for database, every in runs.items():
+        ours = [r for r in every if r.mapper == "ours"]
+        peers = {m: [r for r in every if r.mapper == m] for m in MAPPERS[1:]}
+        peers = {m: own for m, own in peers.items() if own}
+        if not ours or not peers:
+            continue
+        for mapper, own in peers.items():
+            times = [a.seconds / b.seconds for a, b in zip(ours, own, strict=False)]
+            ratios.setdefault(f"time / {mapper}", {})[database] = median(times)
+        most = max(r.num_registered for own in peers.values() for r in own)
+        complete = [own for own in peers.values() if min(r.num_registered for r in own) == most]
+        errors = [_median_error(own) for own in (ours, *complete)]
+        if None not in errors and len(errors) > 1:
+            ratios.setdefault("error / better", {})[database] = errors[0] / min(errors[1:])
+    kinds = list(ratios)
+    rows = [
+        [name, *(f"{ratios[k][name]:.3f}" if name in ratios[k] else "" for k in kinds)]
+        for name in runs
+        if any(name in ratios[k] for k in kinds)
+    ]
+    if len(rows) > 1:
+        means = [f"{np.exp(np.mean(np.log(list(ratios[k].values())))):.3f}" for k in kinds]
+        rows.append(["geometric mean", *means])
+    return (markdown_table(["database", *kinds], rows) if rows else ""), ratios
+
+
+def _median_error(runs: Sequence[MapperRun]) -> Any:
+    errors = [r.mean_error for r in runs]
+    return None if None in errors else median(errors)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -61,6 +61,22 @@ def bars_svg(title: str, label: str, shares: Mapping[str, float]) -> str:
         return _text_of(figure)
 
 
+def ratios_svg(title: str, label: str, ratios: Mapping[str, Mapping[str, float]]) -> str:
+    """Bars of several kinds of ratios for each name, with a line at one."""
+    names = list(dict.fromkeys(name for kind in ratios.values() for name in kind))
+    width = 0.8 / max(len(ratios), 1)
+    with mpl.rc_context(STYLE):
+        figure, axes = _empty(title)
+        for number, (kind, values) in enumerate(ratios.items()):
+            places = np.arange(len(names)) + (number - (len(ratios) - 1) / 2) * width
+            axes.bar(places, [values.get(name, 0.0) for name in names], width=width, label=kind)
+        axes.axhline(1.0, color="0.4", linewidth=0.8)
+        axes.set_xticks(np.arange(len(names)), names, rotation=20, ha="right")
+        axes.set(ylabel=label)
+        axes.legend(frameon=False)
+        return _text_of(figure)
+
+
 def points_svg(title: str, edges: NDArray[np.int64], truth: Array, points: Mapping[str, Array]) -> str:
     """A plane graph and other placements of its vertices: `truth` and each of `points` are (n, 2)."""
     with mpl.rc_context(STYLE):

@@ -1,7 +1,8 @@
 """Side-by-side runs in fresh processes, their table, and what a failing run says."""
 
 import pytest
-from benchmark.mapper_runs import MapperRun, alternate, compared, read_centers, run_mapper
+from benchmark.mapper_runs import MapperRun, alternate, compared, read_centers, run_mapper, summarized
+from paper.plots import ratios_svg
 
 from colmap_vg.errors import ColmapVgError, OptionError
 from colmap_vg.simulation.database import write_synthetic_database
@@ -43,3 +44,20 @@ def test_ratios_are_of_the_same_round():
     assert "| ours | 2 | 4.00 (2.00-6.00) | 100 | 9/9 | 1000 | 0.5 | 1.00 (1.00-1.00) |" in table
     assert "| global | 2 | 6.00 (4.00-8.00) | 100 | 9/9 | 1000 | 0.5 | 0.62 (0.50-0.75) |" in table
     assert "| solve | 1.00 | 90 |" in table
+
+
+def test_the_error_is_compared_with_the_better_of_the_mappers_that_register_most():
+    def runs(ours: float, of_global: float, of_incremental: float, registered: int) -> list[MapperRun]:
+        return [
+            MapperRun("ours", 2.0, 100.0, 9, 9, 1000, ours),
+            MapperRun("global", 4.0, 100.0, 9, 9, 1000, of_global),
+            MapperRun("incremental", 8.0, 100.0, 9, registered, 1000, of_incremental),
+        ]
+
+    text, ratios = summarized({"one": runs(1.0, 2.0, 0.5, 8), "two": runs(1.0, 4.0, 0.5, 9)})
+    assert ratios["error / better"] == {"one": 0.5, "two": 2.0}
+    assert ratios["time / global"] == {"one": 0.5, "two": 0.5}
+    assert ratios["time / incremental"] == {"one": 0.25, "two": 0.25}
+    assert "| geometric mean | 0.500 | 0.250 | 1.000 |" in text
+    assert "one" in ratios_svg("title", "label", ratios)
+    assert summarized({"one": runs(1.0, 2.0, 0.5, 8)[:1]}) == ("", {})
