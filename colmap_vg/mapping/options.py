@@ -15,6 +15,8 @@ TOLERANCE, MAX_NUM_STEPS = 1e-5, 40
 """Relative change of the cost by a step at which bundle adjustment ends, and its maximum number of steps."""
 TRIAL_TOLERANCE = 1e-3
 """The same where only the cost is asked for."""
+MIN_RESIDUALS_FOR_THREADS = 150_000
+"""Residuals, two for each observation, below which one thread is as soon done and takes less of the processors."""
 
 
 def triangulator_options(options: MappingOptions) -> "pycolmap.IncrementalTriangulatorOptions":
@@ -60,6 +62,7 @@ def bundle_options(
     )
     bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     bundle.ceres.loss_function_scale = loss_scale_px
+    bundle.ceres.min_num_residuals_for_cpu_multi_threading = MIN_RESIDUALS_FOR_THREADS
     solver = bundle.ceres.solver_options
     solver.use_inner_iterations = not trial
     solver.function_tolerance, solver.max_num_iterations = TRIAL_TOLERANCE if trial else TOLERANCE, MAX_NUM_STEPS

@@ -5,6 +5,7 @@ import pytest
 
 from colmap_vg.mapping.options import (
     MAX_NUM_STEPS,
+    MIN_RESIDUALS_FOR_THREADS,
     TOLERANCE,
     TRIAL_TOLERANCE,
     bundle_options,
@@ -33,6 +34,7 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
     solver = bundle.ceres.solver_options
     assert (solver.max_num_iterations, solver.function_tolerance) == (MAX_NUM_STEPS, TOLERANCE)
     assert (solver.use_inner_iterations, solver.num_threads) == (True, 3)
+    assert bundle.ceres.min_num_residuals_for_cpu_multi_threading == MIN_RESIDUALS_FOR_THREADS
     solver = bundle_options(options, loss_scale_px=0.7, trial=True).ceres.solver_options
     assert (solver.use_inner_iterations, solver.function_tolerance) == (False, TRIAL_TOLERANCE)
     mapper = mapper_options(options)
