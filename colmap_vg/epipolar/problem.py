@@ -83,7 +83,7 @@ class EpipolarProblem:
         camera = self.camera_idx[self.edges].T
         focal = self.focal_lengths[camera] * np.exp(lenses.log_scales[camera])
         ratios = np.exp(-lenses.log_scales[camera]) if self.lenses_are_free else None
-        pieces, gains = self._straightened(self._pieces, camera, lenses)
+        pieces, gains = self._undistorted(self._pieces, camera, lenses)
         return Matches(pieces, focal**-2.0, ratios, gains)
 
     def without(self, dropped: BoolArray) -> "EpipolarProblem":
@@ -106,10 +106,10 @@ class EpipolarProblem:
         camera = self.camera_idx[triplets.images].T
         focal = self.focal_lengths[camera] * np.exp(lenses.log_scales[camera])
         ratios = np.exp(-lenses.log_scales[camera]) if self.lenses_are_free else None
-        pieces, gains = self._straightened(triplets.pieces, camera, lenses)
+        pieces, gains = self._undistorted(triplets.pieces, camera, lenses)
         return TripletRays(pieces, focal**-2.0, ratios, gains)
 
-    def _straightened(self, pieces: Pieces, camera: IntArray, lenses: Lenses) -> tuple[Pieces, Array | None]:
+    def _undistorted(self, pieces: Pieces, camera: IntArray, lenses: Lenses) -> tuple[Pieces, Array | None]:
         """Pieces of rays after undistortion, and gains (p, s, length), for segments with cameras (s, m)."""
         if self.bent_cameras is None:
             return pieces, None
