@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from image_sets import image_set
 
-from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar
-from colmap_vg.epipolar.covariance import camera_covariances
+from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient
+from colmap_vg.epipolar.covariance import _without_gauge, camera_covariances
 from colmap_vg.epipolar.problem import Lenses
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.similarity import align_positions
@@ -41,6 +41,54 @@ def test_errors_are_as_large_as_the_covariances_say(wrong, free):
     positions, rotations = np.mean(errors, axis=0)
     assert 0.8 < positions < 1.25
     assert 0.75 < rotations < 1.3
+
+
+def with_term(problem):
+    """The problem with a radial term of 0 among the unknowns."""
+    return replace(problem, free_focals=np.array([True]), bent_cameras=np.array([True]))
+
+
+def inverse_hessian(problem, at):
+    """Covariances of positions and rotations (n, 3, 3) under independent unit noise of the residuals."""
+    free, n = np.flatnonzero(problem.free_focals), problem.num_images
+    size = 6 * n + len(free) + (problem.bent_cameras is not None)
+    ends = [
+        np.stack([cost_and_gradient(problem, at.moved(step, free), 1e6)[1] for step in sign * 1e-5 * np.eye(size)])
+        for sign in (1.0, -1.0)
+    ]
+    H = (ends[0] - ends[1]) / 2e-5
+    values, axes = np.linalg.eigh(0.5 * (H + H.T))
+    steps = (axes[:, 7:] / np.sqrt(values[7:]))[: 6 * n]  # the gauge has the seven least
+    turns, shifts = _without_gauge(at, steps.reshape(n, 6, -1))
+    return np.einsum("nad,nbd->nab", shifts, shifts), np.einsum("nad,nbd->nab", turns, turns)
+
+
+def test_an_unknown_radial_term_makes_cameras_as_uncertain_as_the_inverse_hessian_says():
+    problem, R, p = image_set(0, "street", 12, 400, 0.02)
+    problem = replace(problem, keypoints1=None, keypoints2=None, triplets=None, free_focals=np.array([True]))
+    found = replace(adjusted(problem, R, p), scale_px=1e6)
+    problems = problem, with_term(problem)
+    drawn = [camera_covariances(one, found, num_draws=256) for one in problems]
+    exact = [inverse_hessian(one, found.cameras) for one in problems]
+    for kind, most, error in ((0, 1.08, 0.03), (1, 2.5, 0.1)):
+        known, expected = (
+            np.divide(*(np.trace(pair[kind], axis1=1, axis2=2) for pair in (with_it, without)))
+            for without, with_it in ([(one.positions, one.rotations) for one in drawn], exact)
+        )
+        assert expected.max() > most
+        np.testing.assert_allclose(known, expected, rtol=error)  # of 256 draws, the same of both
+
+
+def test_each_unknown_of_the_lens_takes_up_a_residual():
+    problem, R, p = image_set(8, "grid", 12, 200, 0.7)
+    found = adjusted(problem, R, p)
+    held, focal, both = (
+        camera_covariances(one, found, num_draws=1).sigma_px
+        for one in (problem, replace(problem, free_focals=np.array([True])), with_term(problem))
+    )
+    # A standard deviation over the root of the degrees of freedom, of which each unknown takes one.
+    assert held < focal < both
+    assert held**-2 - focal**-2 == pytest.approx(focal**-2 - both**-2, rel=1e-6)
 
 
 def test_covariances_are_those_of_many_draws_of_one_scene():

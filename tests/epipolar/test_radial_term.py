@@ -70,6 +70,27 @@ def test_rays_off_the_axis_and_beyond_a_maximum_stay_finite() -> None:
     np.testing.assert_array_equal(gains[0, [0, 1, 2, 3]], 0.0)
 
 
+def test_only_cameras_with_the_term_are_undistorted() -> None:
+    problem, *_ = image_set(1, "ring", 8, 300, 0.5, free=True)
+    camera = np.arange(8) % 2
+    two = {"camera_idx": camera, "focal_lengths": np.full(2, FOCAL), "free_focals": np.ones(2, dtype=bool)}
+    straight, lenses = replace(problem, **two), Lenses(np.zeros(2), -0.2)
+    curved = replace(bent(straight, lenses.radial_term), bent_cameras=np.array([True, False]))
+
+    def rays_of(seen: EpipolarProblem) -> tuple:
+        return seen.matches(lenses), seen.triplet_rays(seen.triplets, lenses)
+
+    images = straight.edges.T, straight.triplets.images.T
+    problems = curved, straight, replace(curved, bent_cameras=None)
+    for own, found, before, as_seen in zip(images, *map(rays_of, problems), strict=True):
+        for side, seen_by in enumerate(camera[own[:, found.pieces.segments]]):
+            columns = slice(3 * side, 3 * side + 3)
+            expected = np.where((seen_by == 0)[:, None, None], before.pieces.columns, as_seen.pieces.columns)
+            np.testing.assert_allclose(found.pieces.columns[:, columns], expected[:, columns], atol=1e-9)
+            assert (found.radial_gains[seen_by == 0, side].max(axis=1) > 0.0).all()
+            np.testing.assert_array_equal(found.radial_gains[seen_by == 1, side], 0.0)
+
+
 def test_the_term_of_a_bent_lens_is_found_with_its_focal_length_and_positions() -> None:
     problem, R, p = image_set(2, "street", 16, 2500, 0.3, free=True)
     curved = bent(problem, -0.1)

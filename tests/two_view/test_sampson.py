@@ -20,10 +20,11 @@ def matches_of(data, unknowns=0):
     variances = FOCALS1[:m] ** -2.0, FOCALS2[:m] ** -2.0
     matches = sampson.Matches.of_rays(data.offsets, data.bearings1, data.bearings2, *variances)
     pieces = matches.pieces
+    gains = np.random.default_rng(9).uniform(0.1, 0.5, (len(pieces.columns), 2, pieces.columns.shape[2]))
     return replace(
         matches,
         focal_ratios=np.ones((2, m)) if unknowns else None,
-        radial_gains=np.full((len(pieces.columns), 2, pieces.columns.shape[2]), 0.3) if unknowns == 3 else None,
+        radial_gains=gains if unknowns == 3 else None,
     )
 
 
@@ -55,6 +56,9 @@ def test_normal_equations_are_sums_over_the_derivatives_of_residuals(unknowns):
         np.testing.assert_allclose(found.hessians[k], weighted @ J[:, rows].T, rtol=1e-8, atol=1e-6)
         slopes = (1.0 - ratio) / np.square(1.0 + ratio)
         assert found.slopes[k] == pytest.approx(slopes.sum() / (1.0 / (1.0 + ratio)).sum())
+    some = np.array([2, 0])
+    alone = sampson.normal_equations(matches.of(some), data.rotations[some], data.directions[some], scales[some])
+    np.testing.assert_allclose(alone.gradients, found.gradients[some], rtol=1e-9)
 
 
 def test_shrinks_are_those_of_rays_of_longer_focal_lengths():
