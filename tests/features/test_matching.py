@@ -17,8 +17,10 @@ from colmap_vg.events import StageLog
 from colmap_vg.features import matching, pair_matching, pairings
 from colmap_vg.features.extraction import extract_and_match
 from colmap_vg.features.matching import match_features, match_pairs
+from colmap_vg.features.orientation_votes import excess_over_chance
 from colmap_vg.features.pair_selection import preemptive_matches, select_pairs
 from colmap_vg.features.pairings import selected_pairs, sequential_pairs
+from colmap_vg.features.shortlist import partners_of_partners
 from colmap_vg.options import FeatureOptions
 
 QUICK = FeatureOptions(num_threads=2, max_num_features=500, max_image_size=240)
@@ -163,6 +165,7 @@ def test_shortlists_get_positions_and_are_extended_by_shared_partners(
         prior.corr_data_id, prior.pose_prior_id = image.data_id, 1
         database.write_pose_prior(prior)
     chain, seen, tried = np.abs(np.subtract.outer(np.arange(4), np.arange(4))) == 1, [], []
+    counts: list[tuple[np.ndarray, np.ndarray]] = []
 
     def shortlisted(descriptors: np.ndarray, positions: np.ndarray, seed: int) -> np.ndarray:
         seen.append(positions)
@@ -170,10 +173,23 @@ def test_shortlists_get_positions_and_are_extended_by_shared_partners(
 
     def matches(*arguments: object, candidates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         tried.append(arguments[3] if candidates is None else candidates)
-        return preemptive_matches(*arguments[:2], candidates=tried[-1])
+        counts.append(preemptive_matches(*arguments[:2], candidates=tried[-1]))
+        return counts[-1]
+
+    def more(scores: np.ndarray, known: np.ndarray, most: int) -> np.ndarray:
+        assert most == pairings.MORE_CANDIDATES
+        np.testing.assert_array_equal(scores, excess_over_chance(counts[0][1], counts[0][0]))
+        return partners_of_partners(scores, known, most)
+
+    def select(num_matches: np.ndarray, num_consistent: np.ndarray) -> np.ndarray:
+        np.testing.assert_array_equal(num_matches, counts[0][0] + counts[1][0])
+        np.testing.assert_array_equal(num_consistent, counts[0][1] + counts[1][1])
+        return select_pairs(num_matches, num_consistent)
 
     monkeypatch.setattr(pairings, "shortlisted", shortlisted)
     monkeypatch.setattr(pairings, "preemptive_matches", matches)
+    monkeypatch.setattr(pairings, "partners_of_partners", more)
+    monkeypatch.setattr(pairings, "select_pairs", select)
     log = StageLog()
     with log.stage("pairs"):
         pairs = selected_pairs(tmp_path / "a.db", 1, 0, log)
@@ -183,6 +199,7 @@ def test_shortlists_get_positions_and_are_extended_by_shared_partners(
     assert len(tried) == 2
     assert tried[1][0, 2]
     assert not (tried[1] & chain).any()
+    assert all(matches.any() for matches, _ in counts)
     assert len(pairs) > 3
 
 

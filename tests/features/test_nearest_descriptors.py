@@ -1,8 +1,11 @@
 """Matches of descriptors beside brute force without blocks, bundles or float products."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
+from colmap_vg.features import nearest_descriptors
 from colmap_vg.features.nearest_descriptors import (
     MAX_EPIPOLAR_RATIO,
     MAX_RATIO,
@@ -103,6 +106,49 @@ def test_homography_matches_are_those_of_brute_force_near_predicted_places() -> 
     found = {tuple(row) for row in homography_matches(-2.0 * H, points1, points2, first, second, 50.0).tolist()}
     assert found == expected
     assert len(found) > 100
+
+
+def compared_share(monkeypatch: pytest.MonkeyPatch, num1: int, num2: int) -> Callable[[], float]:
+    """Share of the pairs of features whose descriptors have been compared."""
+    compare, sizes = nearest_descriptors._Nearest.compare, []
+
+    def counted(self: object, rows: np.ndarray, columns: np.ndarray, products: np.ndarray) -> None:
+        sizes.append(products.size)
+        compare(self, rows, columns, products)
+
+    monkeypatch.setattr(nearest_descriptors._Nearest, "compare", counted)
+    return lambda: sum(sizes) / (num1 * num2)
+
+
+def test_few_descriptors_are_compared_where_lines_or_places_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(6)
+    first, second = similar_sets(2)
+    points1, points2 = (rng.uniform([0.0, 0.0], [1000.0, 800.0], (len(own), 2)) for own in (first, second))
+    sideways = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    with monkeypatch.context() as patch:
+        share = compared_share(patch, len(first), len(second))
+        epipolar_matches(sideways, points1, points2, first, second, 2.0)
+        assert share() < 0.06
+    with monkeypatch.context() as patch:
+        share = compared_share(patch, len(first), len(second))
+        homography_matches(np.eye(3), points1, points2, first, second, 30.0)
+        assert share() < 0.06
+
+
+def test_lines_at_the_cut_of_their_angles_are_no_exception() -> None:
+    rng = np.random.default_rng(1)
+    first = descriptors(rng, 120)
+    second = disturbed(rng, first, 10)
+    everything = [[row, row] for row in range(120)]
+    for _ in range(20):
+        # The epipole of image 2 is amid the features, so that lines of all angles have some.
+        F = np.cross(np.eye(3), [*rng.uniform(-0.3, 0.3, 2), 1.0]) @ rng.standard_normal((3, 3))
+        points1, points2 = rng.uniform(-1.0, 1.0, (2, 120, 2))
+        lines = np.concatenate([points1, np.ones((120, 1))], axis=1) @ F.T
+        lines /= np.hypot(lines[:, 0], lines[:, 1])[:, None]
+        off = (lines[:, :2] * points2).sum(axis=1) + lines[:, 2] + rng.uniform(-0.009, 0.009, 120)
+        points2 -= off[:, None] * lines[:, :2]
+        assert epipolar_matches(F, points1, points2, first, second, 0.01).tolist() == everything
 
 
 def test_copies_are_ambiguous_whatever_their_norm() -> None:

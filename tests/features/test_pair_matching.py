@@ -1,13 +1,22 @@
 """Pairs are matched by their largest features, and by the others where the geometry of these predicts them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 import pytest
 
 from colmap_vg.features import pair_matching
-from colmap_vg.features.pair_matching import ImageFeatures, PairMatches, match_pair
+from colmap_vg.features.nearest_descriptors import epipolar_matches, homography_matches
+from colmap_vg.features.pair_matching import (
+    MAX_EPIPOLAR_ERROR_PX,
+    MAX_SHIFT,
+    MIN_EPIPOLAR_ERROR_PX,
+    MIN_TRIALS,
+    ImageFeatures,
+    PairMatches,
+    match_pair,
+)
 
 NUM_LARGE, NUM_SMALL, NUM_CLUTTER = 250, 1500, 400
 
@@ -37,7 +46,7 @@ class Pair:
         return match_pair(self.first, self.second, options)
 
 
-def pair(seed: int, *, lens: pycolmap.Camera, flat: bool = False, alike: int = 0) -> Pair:
+def pair(seed: int, *, lens: pycolmap.Camera, flat: bool = False, alike: int = 0, noise_px: float = 0.3) -> Pair:
     """Some of the large features have a look-alike in image 2, far from their epipolar line."""
     rng = np.random.default_rng(seed)
     count = NUM_LARGE + NUM_SMALL
@@ -50,7 +59,7 @@ def pair(seed: int, *, lens: pycolmap.Camera, flat: bool = False, alike: int = 0
     for offset, turn in ((0.0, 0.0), (0.8, -0.06)):
         R = pycolmap.Rotation3d(np.array([0.0, np.sin(turn / 2), 0.0, np.cos(turn / 2)])).matrix()
         local = (points - [offset, 0.0, 0.0]) @ R.T
-        pixels = np.asarray(lens.img_from_cam(local)) + rng.normal(0.0, 0.3, (count, 2))
+        pixels = np.asarray(lens.img_from_cam(local)) + rng.normal(0.0, noise_px, (count, 2))
         pixels = np.concatenate([pixels, rng.uniform(0.0, [1200.0, 900.0], (NUM_CLUTTER, 2))])
         noisy = (shared.astype(int) + rng.integers(-12, 13, shared.shape)).clip(0, 255).astype(np.uint8)
         own = np.concatenate([noisy, descriptors(rng, NUM_CLUTTER)])
@@ -115,3 +124,84 @@ def test_verification_obeys_its_options() -> None:
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = 10 * (NUM_LARGE + NUM_SMALL)
     assert len(pair(0, lens=camera()).matched(options).geometry.inlier_matches) == 0
+
+
+def test_features_that_are_large_in_one_image_only_are_matched() -> None:
+    scene = pair(5, lens=camera())
+    scene.second = replace(scene.second, largest=np.arange(80, NUM_LARGE + 80))
+    recall, precision = share_right(scene.matched().matches, range(80))
+    assert recall > 0.9
+    assert precision > 0.97
+
+
+@pytest.mark.parametrize("lens", [camera(), camera(prior=False)], ids=["known", "unknown"])
+@pytest.mark.parametrize(
+    ("noise_px", "low", "high"),
+    [
+        (0.02, MIN_EPIPOLAR_ERROR_PX, MIN_EPIPOLAR_ERROR_PX),
+        (0.5, 1.5, 3.0),
+        (1.4, MAX_EPIPOLAR_ERROR_PX, MAX_EPIPOLAR_ERROR_PX),
+    ],
+)
+def test_the_distance_from_a_line_follows_the_errors_of_the_large_features(
+    noise_px: float, low: float, high: float, lens: pycolmap.Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def near_lines(*arguments: object) -> np.ndarray:
+        asked.append(arguments[-1])
+        return epipolar_matches(*arguments)
+
+    monkeypatch.setattr(pair_matching, "epipolar_matches", near_lines)
+    pair(0, lens=lens, noise_px=noise_px).matched()
+    unit = lens.mean_focal_length() if lens.has_prior_focal_length else 1.0
+    assert low * (1.0 - 1e-9) <= asked[0] * unit <= high * (1.0 + 1e-9)
+
+
+def test_the_distance_from_a_predicted_place_is_a_share_of_the_longer_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def near_places(*arguments: object) -> np.ndarray:
+        asked.append(arguments[-1])
+        return homography_matches(*arguments)
+
+    monkeypatch.setattr(pair_matching, "homography_matches", near_places)
+    pair(1, lens=camera(), flat=True).matched()
+    assert asked == [MAX_SHIFT * 1200]
+
+
+def test_a_geometry_with_fewer_inliers_than_that_of_the_large_features_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    verify, found = pair_matching._verified, []
+
+    def verified(*arguments: object) -> pycolmap.TwoViewGeometry:
+        found.append(verify(*arguments) if not found else pycolmap.TwoViewGeometry())
+        return found[-1]
+
+    monkeypatch.setattr(pair_matching, "_verified", verified)
+    result = pair(0, lens=camera()).matched()
+    assert len(found) == 2
+    assert result.geometry is found[0]
+    assert set(map(tuple, result.geometry.inlier_matches.tolist())) <= set(map(tuple, result.matches.tolist()))
+
+
+def test_verification_tries_little_and_leaves_its_options_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimate, seen = pycolmap.estimate_two_view_geometry, []
+
+    def estimated(*arguments: object) -> pycolmap.TwoViewGeometry:
+        *_, matches, own = arguments
+        seen.append((len(matches), own.ransac.min_num_trials, own.ransac.min_inlier_ratio))
+        return estimate(*arguments)
+
+    monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", estimated)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.min_inlier_ratio = 0.05
+    before = options.todict()
+    pair(0, lens=camera()).matched(options)
+    assert options.todict() == before
+    assert len(seen) == 2
+    for count, trials, ratio in seen:
+        assert trials == MIN_TRIALS < before["ransac"]["min_num_trials"]
+        assert ratio == max(0.05, options.min_num_inliers / count)
+    assert seen[0][2] > 0.05

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
 from colmap_vg.features.pair_selection import (
+    MAX_PARTNERS,
     StrongestFeatures,
     num_strongest,
     pair_scores,
@@ -107,6 +108,14 @@ def test_no_image_has_more_partners_than_are_of_use() -> None:
     assert len(chosen) <= 6 * n
     assert partners.min() >= 3
     assert np.abs(chosen[:, 0] - chosen[:, 1]).max() <= 6  # the best are kept
+
+
+def test_where_all_see_the_same_only_the_nearest_are_partners() -> None:
+    n = MAX_PARTNERS + 40
+    same = np.full((n, n), 100, np.int32)
+    chosen = select_pairs(same, same)
+    assert (chosen[:, 1] - chosen[:, 0]).max() == MAX_PARTNERS
+    assert np.bincount(chosen.ravel()).min() >= MAX_PARTNERS
 
 
 def test_images_with_few_or_no_features_do_no_harm() -> None:

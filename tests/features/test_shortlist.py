@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from colmap_vg.features import shortlist
-from colmap_vg.features.shortlist import aggregated, partners_of_partners, shortlisted
+from colmap_vg.features.shortlist import aggregated, partners_of_partners, shared_partners, shortlisted
 
 
 def places(num_places: int, views: int, seed: int) -> np.ndarray:
@@ -31,7 +31,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shortlist, "SEQUENCE_NEIGHBORS", 1)
 
 
-def test_small_folders_have_no_shortlist() -> None:
+@pytest.mark.usefixtures("small")
+def test_small_folders_have_no_shortlist(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shortlist, "SIMILAR_IMAGES", 1)
     near = shortlisted(places(2, 3, 0), np.full((6, 3), np.nan), 0)
     np.testing.assert_array_equal(near, ~np.eye(6, dtype=bool))
 
@@ -44,9 +46,10 @@ def test_views_of_one_place_are_on_each_others_list() -> None:
     place = order // 5
     same = (place[:, None] == place) & ~np.eye(60, dtype=bool)
     assert near[same].mean() > 0.95
-    assert near.sum(axis=1).mean() < 20
+    assert near.sum() <= 2 * 60 * (6 + 1)
     np.testing.assert_array_equal(near, near.T)
     assert near[np.arange(59), np.arange(1, 60)].all()  # the sequence
+    assert near[np.arange(58), np.arange(2, 60)].mean() < 0.5
     assert not near.diagonal().any()
 
 
@@ -60,6 +63,7 @@ def test_neighbours_by_position_are_on_the_list(monkeypatch: pytest.MonkeyPatch)
     positions[order] = np.arange(20)[:, None] * [10.0, 0.0, 0.0]
     near = shortlisted(descriptors, positions, 0)
     assert near[order[:-1], order[1:]].all()
+    assert near[order[:-3], order[3:]].mean() < 0.5
     without = shortlisted(descriptors, np.full((30, 3), np.nan), 0)
     assert not without[order[:-1], order[1:]].all()
 
@@ -89,3 +93,22 @@ def test_partners_of_partners_are_found_and_tried_ones_are_not() -> None:
     assert np.argwhere(np.triu(found)).tolist() == [[0, 2]]
     tried[0, 2] = tried[2, 0] = True
     assert not partners_of_partners(scores, tried, 2).any()
+
+
+def star(num_leaves: int) -> np.ndarray:
+    """Scores of pairs of the first image with each of the others, the higher the earlier it is."""
+    scores = np.zeros((num_leaves + 1, num_leaves + 1))
+    scores[0, 1:] = scores[1:, 0] = 10.0 * np.arange(num_leaves, 0, -1)
+    return scores
+
+
+def test_each_image_gets_its_best_partners_of_partners_and_no_more() -> None:
+    scores = star(4)
+    found = partners_of_partners(scores, scores > 0, 1)
+    np.testing.assert_array_equal(found, found.T)
+    assert np.argwhere(np.triu(found)).tolist() == [[1, 2], [1, 3], [1, 4]]
+
+
+def test_a_shared_partner_of_all_says_less_than_one_of_two() -> None:
+    of_all, of_two = star(6), star(2)
+    assert shared_partners(np.minimum(of_all, 10.0))[1, 2] < 0.5 * shared_partners(np.minimum(of_two, 10.0))[1, 2]
