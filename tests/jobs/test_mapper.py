@@ -342,3 +342,28 @@ def test_library_calls_are_quiet_and_leave_the_log_s_level(
     finally:
         pycolmap.logging.minloglevel = level
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("ratio", "trials"), [(0.5, [True, False, False]), (0.99, [True])], ids=["better", "same"])
+def test_separate_lenses_are_tried_briefly_and_adjusted_to_the_end_where_they_are_better(
+    ratio: float, trials: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, models = [], []
+    ratios = iter([ratio, 0.5 * mapper.CONVERGED_COST_RATIO, 1.0])
+
+    def adjusted(_: object, model: pycolmap.Reconstruction, *__: object, trial: bool = False) -> float:
+        assert model is models[0]
+        asked.append(trial)
+        return next(ratios)
+
+    def separate(*_: object) -> pycolmap.Reconstruction:
+        models.append(pycolmap.Reconstruction())
+        return models[-1]
+
+    monkeypatch.setattr(mapper, "adjust_once_more", adjusted)
+    monkeypatch.setattr(mapper, "with_database_cameras", separate)
+    log = StageLog()
+    with log.stage("lenses"):
+        result = mapper._with_database_cameras(None, pycolmap.Reconstruction(), {}, ONE_THREAD, log)
+    assert asked == trials
+    assert result is models[0 if ratio < mapper.SHARED_LENS_COST_RATIO else 1]
