@@ -39,6 +39,8 @@ from colmap_vg.scene.solution import LogEntry
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+CHORD_BELOW, CHORD_ACCURACY = 0.1, 0.03
+"""Outer change below which inner problems are solved by the chord method, and accuracy as a share of the change."""
 MEDIAN_OF_FIVE = 4.3515
 """Median of the chi-square distribution with five degrees of freedom, that of an edge's squared whitened residual."""
 
@@ -142,7 +144,7 @@ def solve_joint(
         robust,
     )
     start = np.swapaxes(initial_rotations, 1, 2), centered(initial_centers)
-    iteration = _OuterIteration(problem, PoseGraphSolver(num_images, edges), *start, accelerate=accelerate)
+    iteration = _OuterIteration(problem, PoseGraphSolver(num_images, edges), *start, accelerate)
     x, count, converged = fixed_point(
         iteration.step,
         iteration.pack(*start),
@@ -197,7 +199,7 @@ class _OuterIteration:
     """
 
     def __init__(
-        self, problem: _JointProblem, solver: PoseGraphSolver, start_Q: Array, start_p: Array, *, accelerate: bool
+        self, problem: _JointProblem, solver: PoseGraphSolver, start_Q: Array, start_p: Array, accelerate: bool
     ) -> None:
         self._problem, self._solver, self._start_Q = problem, solver, start_Q
         self._size = spread(start_p)
@@ -208,7 +210,7 @@ class _OuterIteration:
         # The plain form solves every inner problem accurately, as in the paper; the accelerated one as the change
         # requires.
         self._inner_tolerance, self._tolerance_per_change = (1e-3, 1e-2) if accelerate else (1e-6, 1e-3)
-        self._shrinkage = 1.0
+        self._accelerate, self._change = accelerate, np.inf
         self.cost = np.inf
         self.log: list[LogEntry] = []
 
@@ -224,17 +226,25 @@ class _OuterIteration:
         """Solve PS with scale factors from x, and restore the gauge."""
         Q, p = self.unpack(x)
         cost = self._problem.cost_at(Q, p, self._shortest, self._shortest_weighted)
-        # Near the fixed point the inner minimum is p, scaled as in the last iteration: start there to save steps.
-        Q, p, inner = self._solver.solve(cost, Q, p * self._shrinkage, tolerance=self._inner_tolerance)
+        # The inner minimum is p, scaled: start there to save steps.
+        p = p * cost.best_scale(Q, p)
+        if self._accelerate and self._change < CHORD_BELOW:
+            solved = self._solver.solve_nearby(cost, Q, p, self._unit, CHORD_ACCURACY * self._change)
+            if solved is not None:
+                self.cost = cost.value(*solved)
+                return self._restored(*solved)
+        Q, p, inner = self._solver.solve(cost, Q, p, tolerance=self._inner_tolerance)
         self.cost = inner.cost
+        return self._restored(Q, p)
+
+    def _restored(self, Q: Array, p: Array) -> Array:
         # The global rotation is free: fix the first camera, so that the fixed point is unique.
         turn = self._start_Q[0] @ Q[0].T
-        Q, p = turn @ Q, centered(p @ turn.T)
-        self._shrinkage = spread(p) / self._size
-        return self.pack(Q, regauged(p, self._size, self._reach))
+        return self.pack(turn @ Q, regauged(centered(p @ turn.T), self._size, self._reach))
 
     def note(self, iteration: int, _: Array, change: float) -> None:
         """Log an iteration, and adapt the accuracy of the inner solves to its change."""
+        self._change = change
         self._inner_tolerance = min(self._inner_tolerance, max(self._tolerance_per_change * change, 1e-13))
         name = "2W" if self._problem.robust else "2" + self._problem.approach
         self.log.append(LogEntry(name, iteration, self.cost, change))

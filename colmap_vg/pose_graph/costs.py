@@ -61,6 +61,12 @@ class PoseGraphCost(Protocol):
     def value(self, Q: Array, p: Array) -> float:
         """The objective at camera-to-world rotations Q (n, 3, 3) and centres p (n, 3)."""
 
+    def best_scale(self, Q: Array, p: Array) -> float:
+        """Factor of the centres p of least cost."""
+
+    def gradients(self, Q: Array, p: Array) -> tuple[Array, Array]:
+        """Gradient of each edge's cost by the poses of its first and its second camera, (m, 6) each."""
+
     def derivatives(self, Q: Array, p: Array) -> EdgeTerms:
         """Gradient and Hessian of each edge."""
 
@@ -93,16 +99,19 @@ class ChordalCost:
             + np.sum(self.tau * np.einsum("ka,ka->k", residual, residual))
         )
 
-    def derivatives(self, Q: Array, p: Array) -> EdgeTerms:
+    def best_scale(self, Q: Array, p: Array) -> float:
         i, j = self.edges[:, 0], self.edges[:, 1]
-        M = Q[j] @ self.cam2_from_cam1_rotations @ np.swapaxes(Q[i], 1, 2)
-        s = np.einsum("kab,kb->ka", Q[i], self.cam2_in_cam1_translations)
-        residual = s - (p[j] - p[i])
-        # ||M - exp(u)||^2 with u = w_i - w_j has gradient -4 vee(M); delta (Q_i t) = w_i x s.
+        s, d = (Q[i] @ self.cam2_in_cam1_translations[:, :, None])[:, :, 0], p[j] - p[i]
+        return float(self.tau @ np.einsum("ka,ka->k", s, d) / (self.tau @ np.einsum("ka,ka->k", d, d)))
+
+    def gradients(self, Q: Array, p: Array) -> tuple[Array, Array]:
+        M, s, pull = self._turned(Q, p)
+        return self._gradients(so3.vee(M), s, pull)
+
+    def derivatives(self, Q: Array, p: Array) -> EdgeTerms:
+        M, s, pull = self._turned(Q, p)
         skew = so3.vee(M)
-        turn, pull = -4.0 * self.kappa[:, None] * skew, 2.0 * self.tau[:, None] * residual
-        gradient_i = np.concatenate([turn + np.cross(s, pull), pull], axis=1)
-        gradient_j = np.concatenate([-turn, -pull], axis=1)
+        gradient_i, gradient_j = self._gradients(skew, s, pull)
 
         # Exact Hessian of the chordal term by u while it is safely definite, Gauss-Newton Hessian of the translations.
         trace = np.trace(M, axis1=1, axis2=2)[:, None, None]
@@ -126,6 +135,18 @@ class ChordalCost:
         curvature_ii = 0.5 * (outer + np.swapaxes(outer, 1, 2)) - along + curvature_jj
         curvature_ij = 2.0 * self.kappa[:, None, None] * so3.hat(skew) - curvature_jj
         return EdgeTerms(gradient_i, gradient_j, ii, jj, ij, curvature_ii, curvature_jj, curvature_ij)
+
+    def _turned(self, Q: Array, p: Array) -> tuple[Array, Array, Array]:
+        """Residual rotations (m, 3, 3), measured displacements and pulls on the positions (m, 3), world frame."""
+        i, j = self.edges[:, 0], self.edges[:, 1]
+        M = Q[j] @ self.cam2_from_cam1_rotations @ np.swapaxes(Q[i], 1, 2)
+        s = (Q[i] @ self.cam2_in_cam1_translations[:, :, None])[:, :, 0]
+        return M, s, 2.0 * self.tau[:, None] * (s - (p[j] - p[i]))
+
+    def _gradients(self, skew: Array, s: Array, pull: Array) -> tuple[Array, Array]:
+        # ||M - exp(u)||^2 with u = w_i - w_j has gradient -4 vee(M); delta (Q_i t) = w_i x s.
+        turn = -4.0 * self.kappa[:, None] * skew
+        return np.concatenate([turn + np.cross(s, pull), pull], axis=1), np.concatenate([-turn, -pull], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +178,25 @@ class InformationCost:
         e = self.residuals(Q, p)
         return float(np.einsum("ka,kab,kb->", e, self.information, e, optimize=True))
 
+    def best_scale(self, Q: Array, p: Array) -> float:
+        e = self.residuals(Q, p)
+        e[:, 3:] = -self.cam2_in_cam1_translations  # at scale 0; the residuals grow by d with the scale
+        i, j = self.edges[:, 0], self.edges[:, 1]
+        d = np.einsum("kba,kb->ka", Q[i], p[j] - p[i])
+        weighted = np.einsum("kab,kb->ka", self.information[:, :, 3:], d)
+        return float(-np.vdot(e, weighted) / np.vdot(d, weighted[:, 3:]))
+
+    def gradients(self, Q: Array, p: Array) -> tuple[Array, Array]:
+        return self._linearized(Q, p)[:2]
+
     def derivatives(self, Q: Array, p: Array) -> EdgeTerms:
+        gradient_i, gradient_j, J_i, J_j = self._linearized(Q, p)
+        OJ_i, OJ_j = 2.0 * self.information @ J_i, 2.0 * self.information @ J_j
+        T_i, T_j = np.swapaxes(J_i, 1, 2), np.swapaxes(J_j, 1, 2)
+        return EdgeTerms(gradient_i, gradient_j, T_i @ OJ_i, T_j @ OJ_j, T_i @ OJ_j)
+
+    def _linearized(self, Q: Array, p: Array) -> tuple[Array, Array, Array, Array]:
+        """Gradients (m, 6) by the poses of both cameras, and derivatives (m, 6, 6) of the residuals by them."""
         i, j = self.edges[:, 0], self.edges[:, 1]
         e = self.residuals(Q, p)
         into_i = np.swapaxes(Q[i], 1, 2)
@@ -167,12 +206,4 @@ class InformationCost:
         J_i[:, 3:, :3] = into_i @ so3.hat(p[j] - p[i])
         J_i[:, 3:, 3:], J_j[:, 3:, 3:] = -into_i, into_i
         weighted = 2.0 * np.einsum("kab,kb->ka", self.information, e)
-        OJ_i, OJ_j = 2.0 * self.information @ J_i, 2.0 * self.information @ J_j
-        T_i, T_j = np.swapaxes(J_i, 1, 2), np.swapaxes(J_j, 1, 2)
-        return EdgeTerms(
-            np.einsum("kab,kb->ka", T_i, weighted),
-            np.einsum("kab,kb->ka", T_j, weighted),
-            T_i @ OJ_i,
-            T_j @ OJ_j,
-            T_i @ OJ_j,
-        )
+        return np.einsum("kab,ka->kb", J_i, weighted), np.einsum("kab,ka->kb", J_j, weighted), J_i, J_j

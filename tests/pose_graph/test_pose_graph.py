@@ -147,6 +147,37 @@ def test_cost_never_rises_and_the_end_is_quadratic():
     assert len(log) < 15
 
 
+def test_an_old_factorisation_reaches_the_minimum_of_a_similar_problem():
+    R, p, edges, relative, translations = _pose_graph(20, rotation_sigma=0.05, translation_sigma=0.05)
+    kappa, tau = np.random.default_rng(0).uniform(0.5, 2.0, (2, len(edges)))
+    solver, Q = PoseGraphSolver(20, edges), np.swapaxes(R, 1, 2)
+    Q, p, _ = solver.solve(ChordalCost(edges, relative, translations, kappa, tau), Q, p)
+    similar = ChordalCost(edges, relative, 1.02 * translations, kappa, tau)
+    near_Q, near_p = solver.solve_nearby(similar, Q, p, 1.0, 1e-11)
+    exact_Q, exact_p, _ = PoseGraphSolver(20, edges).solve(similar, Q, p)
+    assert np.abs(near_p - p).max() > 1e-2
+    assert align_positions(near_p, exact_p)[0].max() < 1e-8
+    turn = exact_Q[0] @ near_Q[0].T
+    assert so3.angle(np.swapaxes(exact_Q, 1, 2) @ turn @ near_Q).max() < 1e-8
+    assert similar.value(near_Q, near_p) == pytest.approx(similar.value(exact_Q, exact_p), rel=1e-12)
+
+
+def test_far_from_the_minimum_an_old_factorisation_gives_up():
+    R, p, edges, relative, translations = _pose_graph(20, rotation_sigma=0.05, translation_sigma=0.05)
+    R, p = _perturbed_start(R, p, 1.5)
+    cost = _costs(edges, relative, translations)["chordal"]
+    assert PoseGraphSolver(20, edges).solve_nearby(cost, np.swapaxes(R, 1, 2), p, 1.0, 1e-9) is None
+
+
+@pytest.mark.parametrize("kind", ["chordal", "information"])
+def test_the_best_scale_is_that_of_least_cost(kind):
+    R, p, edges, relative, translations = _pose_graph(8, rotation_sigma=0.3, translation_sigma=0.3)
+    cost, Q = _costs(edges, relative, translations)[kind], np.swapaxes(R, 1, 2)
+    best = cost.best_scale(Q, 3.0 * p)
+    assert best == pytest.approx(1 / 3, rel=0.2)
+    assert cost.value(Q, 3.0 * best * p) < min(cost.value(Q, 3.0 * factor * best * p) for factor in (0.999, 1.001))
+
+
 def test_isotropic_information_is_the_chordal_cost_for_small_angles():
     R, p, edges, relative, translations = _pose_graph(20, rotation_sigma=1e-3, translation_sigma=1e-3, seed=3)
     kappa, tau = 3.0, 2.0
