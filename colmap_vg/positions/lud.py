@@ -28,6 +28,7 @@ def solve_lud(
     weights: Array | None = None,
     *,
     max_num_iterations: int = 100,
+    max_inner_iterations: int = 100,
     tolerance: float = 1e-6,
 ) -> PositionResult:
     """Solve for positions that minimise the unsquared displacement error.
@@ -43,6 +44,8 @@ def solve_lud(
         Multipliers of the (unsquared) residuals, default 1.
     max_num_iterations : int
         Maximum number of reweighting iterations.
+    max_inner_iterations : int
+        Maximum number of Newton steps of each CLS problem.
     tolerance : float
         Relative change of positions below which the iteration ends.
 
@@ -62,7 +65,13 @@ def solve_lud(
     reweighted, converged, inner_tolerance = w, False, ROUGH_TOLERANCE
     for iteration in range(max_num_iterations):
         result = solve_cls(
-            num_images, edges, directions_world, reweighted, initial_centers=p, tolerance=inner_tolerance
+            num_images,
+            edges,
+            directions_world,
+            reweighted,
+            initial_centers=p,
+            max_num_iterations=max_inner_iterations,
+            tolerance=inner_tolerance,
         )
         new = result.projection_centers
         change = np.inf if p is None else float(np.linalg.norm(new - p)) / spread(new)

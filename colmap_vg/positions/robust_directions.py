@@ -130,7 +130,9 @@ def _minimized(
         found = problem.step(at, scale, cost, damping)
         if found is None:
             return at, scale, True
-        at, new_cost, damping = found[0], found[1], found[2] / 10.0
+        # After a rejected step the damping stays: the next step of a tenth would be rejected, too.
+        damping = found[2] / 10.0 if found[2] == damping else found[2]
+        at, new_cost = found[0], found[1]
         change = (cost - new_cost) / cost
         log.append(LogEntry("directions", iteration, new_cost, change))
         if change < tolerance:

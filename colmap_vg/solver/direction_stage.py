@@ -25,11 +25,21 @@ degrees. Without these weights a false pair across a long street would fold it, 
 larger."""
 
 
-def filter_directions(state: SolverState, part: Subgraph, rotations: Array, options: SolveOptions) -> Subgraph:
-    """Drop edges whose directions are outliers; return the largest part whose positions are determined."""
+def filter_directions(
+    state: SolverState, part: Subgraph, rotations: Array, options: SolveOptions
+) -> tuple[Subgraph, Array | None]:
+    """Drop edges whose directions are outliers.
+
+    Returns
+    -------
+    fixed : Subgraph
+        The largest part whose positions are determined.
+    centers : (k, 3) array or None
+        Positions of its images that the robust filter fitted to the directions.
+    """
     rigid = fixed_part(state, part, options)
     if rigid.num_images < 3 or options.outlier_filter == "none":
-        return rigid
+        return rigid, None
     own = rotations[part.rows_of(rigid.images)]
     directions = world_directions(state.graph, rigid, own)
     if options.outlier_filter == "1dsfm":
@@ -39,9 +49,11 @@ def filter_directions(state: SolverState, part: Subgraph, rotations: Array, opti
         state.drop(rigid.edge_rows[broken > options.one_dsfm_threshold], EdgeVerdict.ONE_DSFM)
     elif options.direction_gate_deg > 0:
         weights = edge_weights(state.graph, rigid.edge_rows, options) * _rotation_trust(state.graph, rigid, own)
-        _, angles = robust_direction_residuals(rigid.num_images, rigid.edges, directions, weights)
+        centers, angles = robust_direction_residuals(rigid.num_images, rigid.edges, directions, weights)
         state.drop(rigid.edge_rows[angles > np.radians(options.direction_gate_deg)], EdgeVerdict.DIRECTION_OUTLIER)
-    return fixed_part(state, rigid, options)
+        fixed = fixed_part(state, rigid, options)
+        return fixed, centers[rigid.rows_of(fixed.images)]
+    return fixed_part(state, rigid, options), None
 
 
 def fixed_part(state: SolverState, part: Subgraph, options: SolveOptions) -> Subgraph:

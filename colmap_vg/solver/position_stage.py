@@ -74,10 +74,13 @@ def place_by_lengths(
 
 
 def place_by_directions(
-    state: SolverState, part: Subgraph, poses: PartPoses, options: SolveOptions
+    state: SolverState, part: Subgraph, poses: PartPoses, start: Array | None, options: SolveOptions
 ) -> tuple[Subgraph, PartPoses]:
-    """Solve for positions by a robust fit of the directions; remove images of uncertain position, the worst first."""
-    whole, start = part, None
+    """Solve for positions by a robust fit of the directions; remove images of uncertain position, the worst first.
+
+    Without initial positions `start` (k, 3), those of Alg. 1C are taken.
+    """
+    whole = part
     for rounds_left in reversed(range(MAX_REMOVAL_ROUNDS + 1)):
         n, rotations = part.num_images, poses.rotations[whole.rows_of(part.images)]
         directions = world_directions(state.graph, part, rotations)

@@ -84,7 +84,7 @@ def _solve_part(
     """Run all stages on a connected part; return the solved subgraph with poses, or the unsolvable part and None."""
     rotations, connected = average_rotations(state, part, options, initial)
     connected = admit_confirmed_pairs(state, connected, rotations, options)
-    fixed = filter_directions(state, connected, rotations, options)
+    fixed, centers = filter_directions(state, connected, rotations, options)
     if fixed.num_images < MIN_PART_IMAGES:
         return connected, None
     own = rotations[connected.rows_of(fixed.images)]
@@ -93,7 +93,7 @@ def _solve_part(
         return fixed, place_by_method(state, fixed, poses, options)
     problem = epipolar_problem(state.graph, fixed, options)
     if problem is None:
-        fixed, poses = place_by_directions(state, fixed, poses, options)
+        fixed, poses = place_by_directions(state, fixed, poses, centers, options)
     else:
         poses = place_by_lengths(state, fixed, problem, poses, options)
         fixed, poses = adjust_poses(state, fixed, problem, poses, options)

@@ -19,6 +19,7 @@ from colmap_vg import (
 )
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import so3
+from colmap_vg.geometry.directions import normalized
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.ring_scenes import ring_scene
 from colmap_vg.simulation.views import synthetic_views
@@ -239,3 +240,31 @@ def test_the_weighted_form_needs_information():
         solve_view_graph(replace(scene.graph, edge_information=None), SolveOptions(method="2W"))
     informed = replace(scene.graph, edge_information=np.tile(np.eye(5), (scene.graph.num_edges, 1, 1)))
     assert _errors(solve_view_graph(informed, SolveOptions(method="2W")), scene).max() < 1e-8
+
+
+def _random_view_graph(num_images, degree, sigma, outlier_share, seed=0):
+    """Cameras at random places with random edges, some of them with a random pose: true centres and graph."""
+    rng = np.random.default_rng(seed)
+    R, p = so3.random(num_images, rng), rng.standard_normal((num_images, 3))
+    edges = np.stack(np.triu_indices(num_images, 1), axis=1)
+    edges = edges[rng.random(len(edges)) < degree / (num_images - 1)]
+    i, j = edges.T
+    relative = so3.perturbed(R[j] @ np.swapaxes(R[i], 1, 2), sigma, rng)
+    directions = normalized(np.einsum("kab,kb->ka", R[i], p[j] - p[i]))
+    directions = normalized(directions + sigma * rng.standard_normal(directions.shape))
+    wrong = rng.random(len(edges)) < outlier_share
+    relative[wrong] = so3.random(int(wrong.sum()), rng)
+    directions[wrong] = normalized(rng.standard_normal((int(wrong.sum()), 3)))
+    return p, ViewGraph(np.arange(1, num_images + 1), edges, relative, directions)
+
+
+@pytest.mark.parametrize(
+    ("sigma_deg", "outlier_share", "bound"), [(0.0, 0.0, 1e-9), (1.0, 0.0, 0.012), (1.0, 0.3, 0.016)]
+)
+def test_random_edges_without_matches_are_solved(sigma_deg, outlier_share, bound):
+    p, graph = _random_view_graph(150, 20, np.radians(sigma_deg), outlier_share)
+    solution = solve_view_graph(graph)
+    assert solution.registered.all()
+    assert solution.status == "solved"
+    errors, _ = align_positions(solution.projection_centers, p)
+    assert np.median(errors) < bound * np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1)))
