@@ -23,7 +23,7 @@ from benchmark.growth import Timing, growth_table, looped_scene, timed_rotation_
 from benchmark.mapper_runs import MAPPERS, MapperRun, alternate, compared, summarized
 from benchmark.photograph_runs import WAYS, PhotographRun, alternate_ways, compared_ways
 from paper.markdown import markdown_table
-from paper.plots import growth_svg, ratios_svg
+from paper.plots import lines_svg, ratios_svg
 from paper.scenes import set_conditions, simulated_scene, topology_sets
 
 import colmap_vg
@@ -199,9 +199,10 @@ def rendered_folder(parent: Path, size: int) -> Path:
 
 def plotted(title: str, label: str, series: dict[str, list[Timing]]) -> str:
     """Growth as SVG."""
-    return growth_svg(
+    return lines_svg(
         title,
         label,
+        "seconds",
         {n: (np.array([t.size for t in own]), np.array([t.seconds for t in own])) for n, own in series.items()},
     )
 

@@ -70,6 +70,7 @@ def main() -> None:
             [reports[job] for job in jobs],
             six_vertex_methods=methods_wanted if arguments.six_vertex_draws else (),
             num_draws=arguments.six_vertex_draws,
+            num_ratio_seeds=arguments.seeds,
             overwrite=arguments.overwrite,
         )
     except colmap_vg.ColmapVgError as error:

@@ -1,4 +1,4 @@
-"""Figures as SVG text: histograms, bars, points of a graph, growth."""
+"""Figures as SVG text: histograms, bars, points of a graph, lines."""
 
 import io
 from collections.abc import Mapping
@@ -89,20 +89,20 @@ def points_svg(title: str, edges: NDArray[np.int64], truth: Array, points: Mappi
         return _text_of(figure)
 
 
-def growth_svg(title: str, label: str, series: Mapping[str, tuple[Array, Array]]) -> str:
-    """Lines of seconds over sizes, both axes logarithmic.
+def lines_svg(title: str, label: str, height: str, series: Mapping[str, tuple[Array, Array]]) -> str:
+    """Lines, both axes logarithmic.
 
     Parameters
     ----------
-    title, label : str
-        `label` is the horizontal axis's.
-    series : mapping of name to ((k,) sizes, (k,) seconds)
+    title, label, height : str
+        `label` is the horizontal axis's, `height` the vertical one's.
+    series : mapping of name to ((k,) abscissas, (k,) ordinates)
     """
     with mpl.rc_context(STYLE):
         figure, axes = _empty(title)
-        for name, (sizes, seconds) in series.items():
-            axes.loglog(sizes, seconds, marker="o", markersize=3, label=name)
-        axes.set(xlabel=label, ylabel="seconds")
+        for name, (x, y) in series.items():
+            axes.loglog(x, y, marker="o", markersize=3, label=name)
+        axes.set(xlabel=label, ylabel=height)
         axes.legend(frameon=False)
         return _text_of(figure)
 

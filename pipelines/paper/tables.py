@@ -22,7 +22,8 @@ from colmap_vg.options import Method
 from colmap_vg.simulation.six_vertices import SIX_CENTERS, SIX_EDGES
 from paper.figures import EdgeErrors, edge_errors, scale_factors, shares_outside
 from paper.markdown import csv_text, markdown_table
-from paper.plots import bars_svg, histogram_svg, points_svg
+from paper.noise_ratios import NOISE_RATIOS, ROTATION_DEG, errors_by_ratio
+from paper.plots import bars_svg, histogram_svg, lines_svg, points_svg
 from paper.position_table import MethodErrors, solve_with, table_1, wins
 from paper.scenes import KnownScene, real_scene, set_conditions, simulated_scene
 
@@ -136,6 +137,7 @@ def write_tables(
     *,
     six_vertex_methods: Sequence[Method],
     num_draws: int = 500,
+    num_ratio_seeds: int = 5,
     overwrite: bool = False,
 ) -> Path:
     """Write Markdown, CSV and SVG to ``output_path/tables``, whole or not at all.
@@ -146,9 +148,11 @@ def write_tables(
     reports : sequence of SceneReport
         Of all sets and seeds; a set's figures add up over its seeds.
     six_vertex_methods : sequence of str
-        Methods of Fig. 4; none leaves it out.
+        Methods of Fig. 4 and of the noise ratios; none leaves them out.
     num_draws : int
         Draws of Fig. 4.
+    num_ratio_seeds : int
+        Simulations at each ratio of noises.
     overwrite : bool
         Replace tables that are there already.
 
@@ -168,6 +172,7 @@ def write_tables(
     files.update(_scale_files(reports))
     if six_vertex_methods:
         files.update(_six_vertex_files(six_vertex_methods, num_draws))
+        files.update(_ratio_files(six_vertex_methods, num_ratio_seeds))
     files.update(_error_files(reports))
     files = {"tables.md": "".join(text for name, text in files.items() if name.endswith(".md")), **files}
     draft, target = output / ".work" / TABLES_NAME, output / TABLES_NAME
@@ -243,6 +248,28 @@ def _error_files(reports: Sequence[SceneReport]) -> Iterator[tuple[str, str]]:
         table.append(line)
     header = ["set", *(f"{what}s over 30°, {when} 1DSfM" for what in ("rotation", "direction") for when in _WHEN)]
     yield "fig5.md", f"## Fig. 5: errors of edges before and after 1DSfM\n\n{markdown_table(header, table)}\n"
+
+
+def _ratio_files(methods: Sequence[Method], num_seeds: int) -> Iterator[tuple[str, str]]:
+    errors = errors_by_ratio(methods, num_seeds)
+    best = np.min(list(errors.values()), axis=0)
+    table = [
+        [
+            method,
+            *(f"**{e:.3g}**" if e == least else f"{e:.3g}" for e, least in zip(100.0 * row, 100.0 * best, strict=True)),
+        ]
+        for method, row in errors.items()
+    ]
+    text = markdown_table(["method", *(f"{ratio:g}" for ratio in NOISE_RATIOS)], table)
+    yield (
+        "ratios.md",
+        "## Which method at which ratio of noises\n\nMedian error in percent of the radius of a ring, by the standard"
+        f" deviation of directions over that of rotations ({ROTATION_DEG:g}° in each axis), no outliers; medians over"
+        f" {num_seeds} rings.\n\n{text}\n",
+    )
+    series = {method: (np.array(NOISE_RATIOS), 100.0 * row) for method, row in errors.items()}
+    label = "noise of directions / noise of rotations"
+    yield "ratios.svg", lines_svg("Accuracy by ratio of noises", label, "median error, % of radius", series)
 
 
 _WHEN = ("before", "after")

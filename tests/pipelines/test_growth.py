@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 from benchmark.growth import Timing, fitted_exponent, growth_table, looped_scene, timed_rotation_averaging
-from paper.plots import bars_svg, growth_svg, histogram_svg, points_svg
+from paper.plots import bars_svg, histogram_svg, lines_svg, points_svg
 
 
 def test_exponents_are_those_that_the_times_were_made_with():
@@ -18,13 +18,13 @@ def test_exponents_are_those_that_the_times_were_made_with():
 def test_plots_hold_every_series_and_are_the_same_each_time():
     sizes = np.array([10.0, 100.0, 1000.0])
     series = {"one": (sizes, sizes / 7), "two": (sizes, sizes**2 / 1e4)}
-    drawn = growth_svg("t < u", "images", series)
+    drawn = lines_svg("t < u", "images", "seconds", series)
     root = ET.fromstring(drawn)
     texts = {element.text for element in root.iter("{http://www.w3.org/2000/svg}text")}
     assert {"t < u", "images", "seconds", "one", "two"} <= texts
     markers = [e for e in root.iter("{http://www.w3.org/2000/svg}use") if "fill: #" in e.get("style", "")]
     assert len(markers) == 2 * (len(sizes) + 1)  # and one each in the legend
-    assert growth_svg("t < u", "images", series) == drawn
+    assert lines_svg("t < u", "images", "seconds", series) == drawn
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.sparse as sp
+from paper.noise_ratios import NOISE_RATIOS, errors_by_ratio
 from paper.position_table import MethodErrors, median_over_seeds, table_1, wins
 from paper.scenes import set_conditions
 
@@ -54,16 +55,23 @@ def test_a_quick_run_writes_tables_and_figures(topology, tmp_path):
     assert {row["dataset"] for row in rows} == {"Street"}
     assert all(np.isfinite(float(row["median"])) for row in rows)
     text = (folder / "tables.md").read_text()
-    for heading in ("## Table 1", "## Fig. 2 and 3", "## Fig. 4", "## Fig. 5"):
+    for heading in ("## Table 1", "## Fig. 2 and 3", "## Fig. 4", "## Which method", "## Fig. 5"):
         assert heading in text
     figures = sorted(path.name for path in folder.glob("*.svg"))
-    assert {"fig2_Street.svg", "fig4.svg", "fig4_positions.svg"} <= set(figures)
+    assert {"fig2_Street.svg", "fig4.svg", "fig4_positions.svg", "ratios.svg"} <= set(figures)
     for name in figures:
         assert ElementTree.parse(folder / name).getroot().tag.endswith("svg")
     again = _run(*arguments)
     assert again.returncode == 1
     assert again.stderr.startswith("error: ")
     assert _run(*arguments, "--overwrite", "--resume").returncode == 0
+
+
+def test_directions_correct_rotations_where_they_are_the_better_ones():
+    errors = errors_by_ratio(["1O", "2O", "cls"], 3)
+    assert errors["2O"].shape == (len(NOISE_RATIOS),)
+    assert errors["2O"][0] < errors["1O"][0] < errors["cls"][0]
+    assert (np.diff(errors["1O"]) > 0).all()
 
 
 def test_unknown_sets_are_refused(topology, tmp_path):
