@@ -63,6 +63,9 @@ def _numbers(text: str | tuple[float, ...]) -> tuple[float, ...]:
 
 Switch = Any
 """A boolean whose flag has a value; typer gives ``bool`` a flag without one."""
+ReportSwitch = Annotated[
+    Switch, _switch("--report", help="Write OUT/report.html: a page to look at the result, without a network.")
+]
 RefineIntrinsics = Annotated[
     Switch,
     _switch(*colmap_flags.REFINE_INTRINSICS, help="Refine focal lengths and distortion coefficients (GLOMAP's flag)."),

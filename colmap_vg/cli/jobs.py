@@ -7,7 +7,7 @@ from pathlib import Path
 import pycolmap
 
 from colmap_vg.cli.reporter import Reporter
-from colmap_vg.errors import MappingError
+from colmap_vg.errors import DatabaseError, DataFileError, MappingError, OutputError
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.bridges import all_bridges
 from colmap_vg.jobs.image_folder import DATABASE_NAME, make_database
@@ -34,6 +34,7 @@ from colmap_vg.jobs.verdict_tables import (
 )
 from colmap_vg.mapping.weak_cuts import WeakCut
 from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.report.page import write_report
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.scene.view_graph import ViewGraph
 
@@ -53,6 +54,7 @@ def run(
     options: MappingOptions,
     resume: bool,
     reporter: Reporter,
+    with_report: bool = True,
 ) -> None:
     """From a folder of photographs to models."""
     configure_colmap_log(reporter.verbose)
@@ -66,7 +68,7 @@ def run(
         result = make_database(image_path, output_path, features, log, overwrite=options.overwrite, resume=resume)
         mapped = map_database(output_path / DATABASE_NAME, image_path, output_path, options, log)
         skipped = {file.name: file.reason for file in result.skipped}
-        _finish("run", {**asked, "resume": resume}, mapped, output_path, reporter, skipped)
+        _finish("run", {**asked, "resume": resume}, mapped, output_path, reporter, with_report, skipped)
 
 
 def mapper(
@@ -76,6 +78,7 @@ def mapper(
     options: MappingOptions,
     resume: bool,
     reporter: Reporter,
+    with_report: bool = True,
 ) -> None:
     """From a database to models."""
     configure_colmap_log(reporter.verbose)
@@ -86,7 +89,7 @@ def mapper(
             return
         options = replace(options, overwrite=job.overwrite)
         mapped = map_database(database_path, image_path, output_path, options, StageLog(reporter.on_event))
-        _finish("mapper", {**asked, "resume": resume}, mapped, output_path, reporter, {})
+        _finish("mapper", {**asked, "resume": resume}, mapped, output_path, reporter, with_report)
 
 
 def solve(
@@ -166,6 +169,7 @@ def demo(
     overwrite: bool,
     resume: bool,
     reporter: Reporter,
+    with_report: bool = True,
 ) -> None:
     """Render a scene, run it, and compare with the truth."""
     from colmap_vg.demo import run_demo
@@ -191,6 +195,7 @@ def demo(
             mapped,
             output_path,
             reporter,
+            with_report,
             further={"comparison": plain(comparison)},
         )
         reporter.say(comparison.summary)
@@ -204,27 +209,46 @@ def explain(output_path: Path, image: str | None, pair: tuple[str, str] | None) 
     return explain_job(tables, told_bridges(output_path)) if image is None else explain_image(tables, image)
 
 
+def report(output_path: Path, image_path: Path | None, database_path: Path | None, reporter: Reporter) -> None:
+    """The report of a finished job, from its files."""
+    configure_colmap_log(reporter.verbose)
+    reporter.say(f"report: {write_report(output_path, image_path, database_path)}")
+
+
 def _finish(
     verb: str,
     asked: Mapping[str, object],
     mapped: MappingResult,
     output_path: Path,
     reporter: Reporter,
+    with_report: bool,
     skipped: Mapping[str, str] | None = None,
     further: Mapping[str, object] | None = None,
 ) -> None:
-    """Write the summary of a mapping job, and say what came out."""
+    """Write the summary and the report of a mapping job, and say what came out."""
     content = job_summary(verb, asked, reporter.records, reporter.warnings)
     content |= _verdicts(mapped.graph, mapped.solution, output_path, skipped or {}, mapped.weak_cuts)
     content["models"] = [
         model_summary(output_path / str(index), model) | {"agreement": plain(mapped.solution.agreement[index])}
         for index, model in mapped.models.items()
     ]
-    write_summary(output_path, {**content, **(further or {})})
+    content |= further or {}
+    write_summary(output_path, content)
     for index, model in mapped.models.items():
         size = f"{model.num_reg_images()} of {mapped.graph.num_images} images, {model.num_points3D()} points"
         error = f"mean reprojection error {model.compute_mean_reprojection_error():.2f} px"
         reporter.say(f"{output_path / str(index)}: {size}, {error}")
+    if with_report:
+        _report(output_path, content, reporter)
+
+
+def _report(output_path: Path, content: Mapping[str, object], reporter: Reporter) -> None:
+    """Write the report of a finished job; where it fails the job keeps its models, and the summary says so."""
+    try:
+        reporter.say(f"report: {write_report(output_path)}")
+    except (DatabaseError, DataFileError, OutputError) as error:
+        reporter.warn(f"The report was not written: {error}")
+        write_summary(output_path, {**content, "warnings": list(reporter.warnings)})
 
 
 def _verdicts(

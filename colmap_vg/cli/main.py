@@ -49,6 +49,8 @@ def run(
     solve: flags.SolveFlags,
     read: flags.ReadFlags,
     model: flags.ModelFlags,
+    report: flags.ReportSwitch = "1",
+    *,
     job: flags.JobFlags,
 ) -> None:
     """From a folder of photographs to models: features, matching, viewing graph, triangulation, bundle adjustment."""
@@ -56,7 +58,7 @@ def run(
         feature_options, options = flags.feature_options(features, job), flags.mapping_options(read, solve, job, model)
         import colmap_vg.cli.jobs as jobs
 
-        jobs.run(image_path, output_path, feature_options, options, job.resume, reporter)
+        jobs.run(image_path, output_path, feature_options, options, job.resume, reporter, report)
 
 
 @app.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -71,6 +73,7 @@ def mapper(
     read: flags.ReadFlags,
     model: flags.ModelFlags,
     optimize_intrinsics: flags.RefineIntrinsics = None,
+    report: flags.ReportSwitch = "1",
     job: flags.JobFlags,
 ) -> None:
     """From a COLMAP database to models. Takes the flags of colmap's and glomap's mappers.
@@ -90,7 +93,7 @@ def mapper(
             reporter.warn(f"{flag} has no counterpart in colmap-vg and is ignored")
         import colmap_vg.cli.jobs as jobs
 
-        jobs.mapper(database_path, image_path, output_path, options, job.resume, reporter)
+        jobs.mapper(database_path, image_path, output_path, options, job.resume, reporter, report)
 
 
 @app.command()
@@ -116,13 +119,14 @@ def demo(
     output_path: flags.OutputPath,
     num_images: Annotated[int, typer.Option("--num_images", min=3, help="Number of photographs to render.")] = 24,
     *,
+    report: flags.ReportSwitch = "1",
     job: flags.JobFlags,
 ) -> None:
     """Render photographs of a scene from known cameras, make a model of them, and compare it with the truth."""
     with _job(job.quiet, job.verbose) as reporter:
         import colmap_vg.cli.jobs as jobs
 
-        jobs.demo(output_path, num_images, job.seed, job.num_threads, job.overwrite, job.resume, reporter)
+        jobs.demo(output_path, num_images, job.seed, job.num_threads, job.overwrite, job.resume, reporter, report)
 
 
 @app.command()
@@ -143,6 +147,24 @@ def explain(
 
         for line in jobs.explain(output_path, image, pair):
             reporter.say(line)
+
+
+@app.command()
+def report(
+    output_path: Annotated[Path, typer.Option("--output_path", help="Folder of a finished job.")],
+    image_path: Annotated[
+        Path | None, typer.Option("--image_path", help="Folder of the photographs. Default: that of the job.")
+    ] = None,
+    database_path: Annotated[
+        Path | None,
+        typer.Option("--database_path", help="The job's database, never modified. Default: that of the job."),
+    ] = None,
+) -> None:
+    """Write OUT/report.html: a page to look at the result of a finished job, without a network."""
+    with _job(False, False) as reporter:
+        import colmap_vg.cli.jobs as jobs
+
+        jobs.report(output_path, image_path, database_path, reporter)
 
 
 def main() -> None:

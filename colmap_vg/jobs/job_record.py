@@ -129,7 +129,11 @@ def _is_written(file: Path, source: Path, output_path: Path) -> bool:
     if source.resolve() in output.parents:
         return output in file.resolve().parents
     first = file.relative_to(source).parts[0] if source.resolve() == output else ""
-    return first == WORK_NAME or first.isdecimal() or first.endswith((".db", ".db-wal", ".db-shm", ".json", ".csv"))
+    return (
+        first == WORK_NAME
+        or first.isdecimal()
+        or first.endswith((".db", ".db-wal", ".db-shm", ".json", ".csv", ".html"))
+    )
 
 
 def _read(path: Path) -> dict[str, object]:

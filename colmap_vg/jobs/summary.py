@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from colmap_vg._version import __version__
 from colmap_vg.errors import OutputError
@@ -82,8 +82,8 @@ def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
     atomic_write(output_path / FILE_NAME, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
-def told_bridges(output_path: Path) -> list[str]:
-    """Read the sentences on the links between and within models from the summary of a finished job.
+def read_summary(output_path: Path) -> dict[str, Any]:
+    """Read the summary of a finished job.
 
     Raises
     ------
@@ -92,11 +92,33 @@ def told_bridges(output_path: Path) -> list[str]:
     """
     path = output_path / FILE_NAME
     try:
-        return [str(bridge["told"]) for bridge in json.loads(path.read_text(encoding="utf-8"))["bridges"]]
+        content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise OutputError(f"cannot read {path}: {error.strerror}; run the job again") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise OutputError(f"{path} is damaged or was written by another version: run the job again") from error
+    except ValueError as error:
+        raise damaged_summary(output_path) from error
+    if not isinstance(content, dict):
+        raise damaged_summary(output_path)
+    return content
+
+
+def damaged_summary(output_path: Path) -> OutputError:
+    """Return the error for a summary that lacks what this version writes."""
+    return OutputError(f"{output_path / FILE_NAME} is damaged or was written by another version: run the job again")
+
+
+def told_bridges(output_path: Path) -> list[str]:
+    """Read the sentences on the links between and within models from the summary of a finished job.
+
+    Raises
+    ------
+    OutputError
+        There is no summary, or it is damaged.
+    """
+    try:
+        return [str(bridge["told"]) for bridge in read_summary(output_path)["bridges"]]
+    except (KeyError, TypeError) as error:
+        raise damaged_summary(output_path) from error
 
 
 def plain(value: object) -> object:

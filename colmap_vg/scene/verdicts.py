@@ -68,15 +68,18 @@ class ImageVerdict(Verdict):
     )
 
 
-class SolutionStatus(StrEnum):
+class SolutionStatus(Verdict):
     """How a viewing-graph solve ended."""
 
-    SOLVED = "solved"
-    PARTIAL = "partial"
-    """Solved, but some images are not in the largest model."""
-    DOUBTFUL = "doubtful"
-    """Too many pairs contradict the model, or another arrangement of its images agrees with nearly as many matches."""
-    NOT_CONVERGED = "not_converged"
-    """The iteration limit was reached; the poses are the best found."""
-    UNSOLVABLE = "unsolvable"
-    """Nothing could be solved: no usable edges, or no three images whose positions are determined."""
+    SOLVED = "solved", "every image has a pose in one frame"
+    PARTIAL = "partial", "some images are not in the largest model"
+    DOUBTFUL = (
+        "doubtful",
+        "the model may be folded, or may join two places that look alike: too many pairs contradict it, or another"
+        " arrangement of its images agrees with nearly as many matches",
+    )
+    NOT_CONVERGED = "not_converged", "an iteration limit was reached; the poses are the best found"
+    UNSOLVABLE = (
+        "unsolvable",
+        "nothing could be solved: there are no usable pairs, or no three images whose positions are determined",
+    )

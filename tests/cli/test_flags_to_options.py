@@ -47,7 +47,7 @@ def mapping(jobs: Jobs, *flags: str) -> MappingOptions:
 
 def test_no_flags_are_the_librarys_defaults(jobs: Jobs) -> None:
     assert mapping(jobs) == MappingOptions()
-    image_path, output_path, features, options, resume, _ = called(
+    image_path, output_path, features, options, resume, *_ = called(
         jobs, "run", "--image_path", "i", "--output_path", "o"
     )
     assert (image_path, output_path, resume) == (Path("i"), Path("o"), False)
