@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pycolmap
 
+from colmap_vg.cli.closing import closing_lines
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.errors import DatabaseError, DataFileError, MappingError, OutputError
 from colmap_vg.events import StageLog
@@ -234,10 +235,8 @@ def _finish(
     ]
     content |= further or {}
     write_summary(output_path, content)
-    for index, model in mapped.models.items():
-        size = f"{model.num_reg_images()} of {mapped.graph.num_images} images, {model.num_points3D()} points"
-        error = f"mean reprojection error {model.compute_mean_reprojection_error():.2f} px"
-        reporter.say(f"{output_path / str(index)}: {size}, {error}")
+    for line in closing_lines(content, output_path):
+        reporter.say(line)
     if with_report:
         _report(output_path, content, reporter)
 
