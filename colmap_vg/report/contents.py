@@ -94,7 +94,7 @@ def _models(output_path: Path, rows: Mapping[str, int], notes: list[str]) -> tup
     views = tuple(model_view(name, model, rows, int(share * model.num_points3D())) for name, model in read)
     if share < 1.0:
         shown = sum(len(view.points) for view in views)
-        notes.append(f"The 3-D view shows every {total / shown:.1f}th point on average, {shown:,} of {total:,}.")
+        notes.append(f"The 3-D view shows {shown:,} of {total:,} points, evenly chosen.")
     far = sum(view.num_far for view in views)
     if far:
         notes.append(f"The 3-D view does not show {far:,} points far from the scene.")

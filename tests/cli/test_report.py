@@ -10,6 +10,7 @@ from typer.testing import CliRunner, Result
 import colmap_vg.cli.jobs
 from colmap_vg.cli.main import app
 from colmap_vg.errors import OutputError
+from colmap_vg.jobs.job_record import recorded_job
 
 
 def invoke(*arguments: object) -> Result:
@@ -59,6 +60,19 @@ def test_a_folder_without_a_job_is_an_error(tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert result.stderr.startswith("error: cannot read")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_report_among_the_photographs_is_no_change_of_them(tmp_path: Path) -> None:
+    def job(resume: bool) -> bool:
+        with recorded_job(tmp_path, "run", {}, tmp_path, overwrite=False, resume=resume) as state:
+            (tmp_path / "0").mkdir(exist_ok=True)
+            (tmp_path / "0" / "images.bin").write_bytes(b"model")
+            (tmp_path / "report.html").write_text("report")
+            return state.finished
+
+    (tmp_path / "photograph.jpg").write_bytes(b"photograph")
+    assert not job(resume=False)
+    assert job(resume=True)
 
 
 def test_a_report_that_fails_leaves_the_model(

@@ -15,7 +15,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 COUNT_COLORS = """async () => {
   const image = new Image(), canvas = document.createElement("canvas");
-  image.src = await Plotly.toImage("scene", {format: "png", width: 300, height: 300});
+  image.src = await Plotly.toImage("model-view", {format: "png", width: 300, height: 300});
   await image.decode();
   canvas.width = canvas.height = 300;
   const context = canvas.getContext("2d");
@@ -82,6 +82,15 @@ def test_tables_sort_search_and_select(page: Any) -> None:
     assert page.inner_text("#selected .title") in HOSTILE_NAMES
     page.click("#worst")
     assert page.locator("#selected svg line").count() > 0
+
+
+def test_a_click_in_the_view_selects_an_image(page: Any) -> None:
+    page.evaluate(
+        "document.getElementById('model-view').emit('plotly_click', {points: [{curveNumber: 2, customdata: 3}]})"
+    )
+    page.wait_for_selector("#selected .title")
+    assert page.inner_text("#selected h3 >> nth=0") == "Image"
+    assert page.locator("#images-table tr[aria-selected=true]").get_attribute("data-row") == "3"
 
 
 def test_a_phone_needs_no_scrolling_sideways(browser: Any, report: Path) -> None:

@@ -87,17 +87,18 @@ function drawCharts() {
   agreementChart();
 }
 
-// Clicks in the agreement chart and the matrix select a pair; the pair under the pointer is named in the title.
+// Clicks in the agreement chart and the matrix select a pair; the caption names the pair under the pointer.
 function listenToCharts() {
   for (const id of ["chart-agreement", "chart-matrix"]) {
-    const chart = byId(id);
+    const chart = byId(id), told = chart.parentElement.querySelector("output");
     if (!chart.on) continue;
     const pairAt = (event) => event.points[0].customdata;
     chart.on("plotly_hover", (event) => {
       const k = pairAt(event);
-      chart.title = k >= 0 ? `${imageName(pairs.a[k])} – ${imageName(pairs.b[k])}: ${pairs.inliers[k]} inliers, ` +
-        `${pairs.verdict[k]} ${degrees(pairs.rotation[k])}` : "";
+      told.textContent = k < 0 ? "" : `${imageName(pairs.a[k])} – ${imageName(pairs.b[k])}, ${pairs.inliers[k]} inliers, ` +
+        [pairs.verdict[k], degrees(pairs.rotation[k])].join(" ");
     });
+    chart.on("plotly_unhover", () => { told.textContent = ""; });
     chart.on("plotly_click", (event) => { if (pairAt(event) >= 0) select({ pair: pairAt(event) }, "table"); });
   }
 }

@@ -33,7 +33,7 @@ function setUpControls() {
   byId("worst").addEventListener("click", () => { if (worstShown() >= 0) select({ pair: worstShown() }, "controls"); });
   for (const button of document.querySelectorAll("[data-eye]")) {
     const [x, y, z] = button.dataset.eye.split(",").map(Number);
-    button.addEventListener("click", () => Plotly.relayout("scene", { "scene.camera": { eye: { x, y, z }, up: { x: 0, y: 0, z: 1 } } }));
+    button.addEventListener("click", () => Plotly.relayout("model-view", { "scene.camera": { eye: { x, y, z }, up: { x: 0, y: 0, z: 1 } } }));
   }
   byId("theme").addEventListener("click", () => {
     applyTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");

@@ -1,7 +1,7 @@
 "use strict";
 // The 3-D view: points, cameras as frusta, and the pairs that pass the filters.
 const view = { model: 0, shown: [], config: { displaylogo: false, responsive: true, scrollZoom: true,
-  modeBarButtonsToRemove: ["toImage", "hoverClosest3d", "tableRotation"] } };
+  modeBarButtons: [["zoom3d", "pan3d", "orbitRotation", "resetCameraDefault3d"]] } };
 const TRACES = { points: 0, frusta: 1, cameras: 2, edges: 3, middles: 4, picked: 5 };
 
 function currentModel() {
@@ -115,9 +115,11 @@ function pickedTrace(model) {
 
 function sceneLayout(model) {
   const axis = (k) => ({ visible: false, range: [model.low[k], model.high[k]] });
+  const sides = model.high.map((high, k) => high - model.low[k]);
+  const [x, y, z] = sides.map((side) => 1.3 * side / Math.max(...sides));
   return {
     margin: { l: 0, r: 0, t: 0, b: 0 }, showlegend: false, paper_bgcolor: style("panel"), uirevision: view.model,
-    scene: { aspectmode: "data", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), dragmode: "orbit",
+    scene: { aspectmode: "manual", aspectratio: { x, y, z }, xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), dragmode: "orbit",
       camera: { eye: { x: 1, y: 1, z: 0.8 } }, uirevision: view.model },
   };
 }
@@ -128,15 +130,15 @@ function drawScene() {
   const traces = [pointTrace(model), ...cameraTraces(model), ...edgeTraces(model), pickedTrace(model)];
   traces[TRACES.points].visible = byId("show-points").checked;
   traces[TRACES.frusta].visible = traces[TRACES.cameras].visible = byId("show-cameras").checked;
-  return Plotly.react("scene", traces, sceneLayout(model), view.config);
+  return Plotly.react("model-view", traces, sceneLayout(model), view.config);
 }
 
 // Replaces only some traces, so that many points are not read again.
 function replaceTraces(traces, first) {
-  const drawn = byId("scene").data;
+  const drawn = byId("model-view").data;
   if (!drawn) return;
   traces.forEach((trace, k) => { drawn[first + k] = trace; });
-  Plotly.react("scene", [...drawn], byId("scene").layout, view.config);
+  Plotly.react("model-view", [...drawn], byId("model-view").layout, view.config);
 }
 
 function drawEdges() {

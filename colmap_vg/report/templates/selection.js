@@ -1,5 +1,7 @@
 "use strict";
-// The card that follows the pointer, and the panel on what is selected.
+// The card at the pointer, and the panel on what is selected.
+const pointer = { x: 0, y: 0 };
+
 function showCard(event) {
   const card = byId("card"), point = event.points[0];
   const row = point.customdata;
@@ -13,20 +15,23 @@ function showCard(event) {
     for (const [name, value] of pairFigures(row)) card.append(element("p", `${name}: ${value}`));
   }
   card.hidden = false;
-  const place = byId("scene").getBoundingClientRect();
-  const left = (event.event?.clientX ?? place.left) - place.left, top = (event.event?.clientY ?? place.top) - place.top;
+  const place = byId("model-view").getBoundingClientRect();
+  const left = pointer.x - place.left, top = pointer.y - place.top;
   card.style.left = `${Math.max(0, Math.min(left + 14, place.width - card.offsetWidth - 4))}px`;
   card.style.top = `${Math.max(0, Math.min(top + 14, place.height - card.offsetHeight - 4))}px`;
 }
 
 function listenToScene() {
-  const scene = byId("scene");
+  const scene = byId("model-view");
   if (!scene.on) return;
+  scene.addEventListener("pointermove", ({ clientX, clientY }) => Object.assign(pointer, { x: clientX, y: clientY }), true);
   scene.on("plotly_hover", showCard);
   scene.on("plotly_unhover", () => { byId("card").hidden = true; });
   scene.on("plotly_click", (event) => {
     const { curveNumber, customdata } = event.points[0];
-    select(curveNumber === TRACES.cameras ? { image: customdata } : { pair: customdata }, "scene");
+    const kind = curveNumber === TRACES.cameras ? "image" : "pair";
+    // Sent with each frame while the button is down, in the middle of drawing: drawing again waits for its end.
+    if (selection.current[kind] !== customdata) setTimeout(select, 0, { [kind]: customdata }, "view");
   });
 }
 
