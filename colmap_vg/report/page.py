@@ -10,7 +10,7 @@ from markupsafe import Markup
 from colmap_vg.jobs.atomic_write import atomic_write
 from colmap_vg.jobs.summary import damaged_summary
 from colmap_vg.report.contents import Contents, gather
-from colmap_vg.report.overview import overview
+from colmap_vg.report.overview import Overview, overview
 from colmap_vg.report.payload import payload, script_json
 
 FILE_NAME = "report.html"
@@ -38,22 +38,22 @@ def write_report(output_path: Path, image_path: Path | None = None, database_pat
     """
     contents = gather(output_path, image_path, database_path)
     try:
-        text = render(contents)
+        told = overview(contents)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise damaged_summary(output_path) from error
     path = output_path / FILE_NAME
-    atomic_write(path, text)
+    atomic_write(path, render(contents, told))
     return path
 
 
-def render(contents: Contents) -> str:
+def render(contents: Contents, told: Overview) -> str:
     """Return the page as HTML."""
     environment = Environment(
         loader=PackageLoader("colmap_vg.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     # Constants of this package and JSON without any of HTML's characters: nothing in them is to be escaped.
     return environment.get_template("report.html.j2").render(
-        overview=overview(contents),
+        overview=told,
         notes=contents.notes,
         has_matches=bool(contents.matches),
         style=Markup(_asset("report.css")),

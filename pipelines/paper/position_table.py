@@ -39,6 +39,7 @@ class MethodErrors:
     num_iterations : int
         Lines in the iteration log of the method's own stage.
     converged : bool
+        Whether the solution is neither doubtful nor short of convergence.
     seconds : float
         Of the whole chain.
     """

@@ -205,7 +205,8 @@ def _position_files(reports: Sequence[SceneReport]) -> Iterator[tuple[str, str]]
     yield (
         "table1.md",
         "## Table 1: errors of positions\n\nRMS / mean / median in the truth's unit after the best similarity; m edges"
-        " and n images after 1DSfM; medians over seeds. † not converged on some seed.\n\n"
+        " and n images after 1DSfM; medians over seeds. † not converged, or doubtful,"
+        " on some seed.\n\n"
         f"{table_1(rows)}\n{wins(rows)}\n",
     )
     yield "table1.csv", csv_text(rows, MethodErrors)
