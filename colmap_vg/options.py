@@ -84,7 +84,7 @@ class SolveOptions(_Checked):
     certify_rotations: bool = False  # warn whether chordal rotations are a global optimum (by an eigenvalue)
     outlier_filter: OutlierFilter = "robust"
     rotation_gate_deg: float = _number(10.0, 0.0, 180.0)  # degrees; edges with a larger error are dropped; 0: no gate
-    one_dsfm_threshold: float = _number(0.1, 0.0)  # maximum broken weight, mean |projection|, dimensionless
+    one_dsfm_threshold: float = _number(0.1, 0.0)  # maximum broken weight, mean absolute projection, dimensionless
     one_dsfm_num_directions: int = _number(48, 1)  # random projection directions
     direction_gate_deg: float = _number(15.0, 0.0, 180.0)  # degrees; gate of the robust direction filter; 0: no gate
     edge_weights: Literal["unit", "inliers", "information"] = "information"  # inliers: sqrt(number), planar a third

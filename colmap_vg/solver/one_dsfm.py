@@ -47,8 +47,8 @@ def one_dsfm_broken_weights(
     Returns
     -------
     (m,) array
-        Sum of |projection| over the lines whose order violates the edge, divided by the number of lines; 0 to 1. The
-        paper drops edges above 0.1.
+        Sum of the absolute projections over the lines whose order violates the edge, divided by the number of lines; 0
+        to 1. The paper drops edges above 0.1.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def order_positions(
     directions : (m, 3) array
     lines : (d, 3) array
     weights : (m,) array, optional
-        Multipliers of |projection|.
+        Multipliers of the absolute projections.
 
     Returns
     -------

@@ -1,0 +1,62 @@
+"""Sphinx configuration: ``sphinx-build -W --keep-going -b html docs OUT``. The build needs no network."""
+
+import zlib  # noqa: F401  -- must come before pycolmap
+
+# isort: split
+import inspect
+import re
+from typing import Any
+
+import colmap_vg
+from colmap_vg import options
+
+project = "colmap_vg"
+release = version = colmap_vg.__version__
+author = "the colmap_vg authors"
+copyright = author
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "numpydoc"]
+exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+html_theme = "furo"
+html_title = f"colmap_vg {release}"
+html_copy_source = False
+
+myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_heading_anchors = 3
+
+autosummary_generate = True
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # numpydoc tells types with shapes and units
+autodoc_default_options = {"members": True, "undoc-members": False}
+numpydoc_show_class_members = False
+numpydoc_attributes_as_param_list = True
+
+
+def field_comments(option_class: type) -> list[str]:
+    """Lines of a numpydoc section for the fields of an options class, whose meanings are comments in the source."""
+    pattern = re.compile(r"^    (\w+): (.+?) = (.+?)(?:  # (.+))?$", re.MULTILINE)
+    lines = ["", "Parameters", "----------"]
+    for name, kind, value, comment in pattern.findall(inspect.getsource(option_class)):
+        number = re.fullmatch(r"_number\(([^,]+), ([^,]+)(?:, ([^,]+))?\)", value)
+        if number is not None:
+            default, low, high = number.groups()
+            limits = f"{low} to {high}" if high else f"at least {low}"
+            told = f"{kind}, {limits}, default {default}"
+        elif value.startswith("field("):
+            told = kind
+        else:
+            told = f"{kind}, default {value}"
+        lines += [f"{name} : {told}", *([f"    {comment[0].upper()}{comment[1:]}."] if comment else [])]
+    return lines
+
+
+def describe_options(_app: object, what: str, _name: str, found: object, _options: object, lines: list[str]) -> None:
+    """Add the fields of options classes to their docstrings, before numpydoc reads these."""
+    if what == "class" and inspect.isclass(found) and found.__module__ == options.__name__:
+        lines += field_comments(found)
+
+
+def setup(app: Any) -> None:
+    """Connect the hooks."""
+    app.connect("autodoc-process-docstring", describe_options, priority=400)
