@@ -11,6 +11,7 @@ import pytest
 from rendered_corner import render_corner
 
 from colmap_vg import align_positions
+from colmap_vg.report.page import write_report
 
 OPTIONS = ["--max_num_features", "500", "--max_image_size", "320"]
 MAX_POSITION_SHARE, MAX_ANGLE_DEG = 1e-3, 0.05
@@ -40,8 +41,11 @@ def test_one_thread_gives_the_same_bits(images_path: Path, tmp_path: Path) -> No
     assert files == {path.relative_to(second) for path in second.rglob("*") if path.is_file()}
     names = {str(file) for file in files}
     assert {"database.db", "images.csv", "pairs.csv", "summary.json", "0/images.bin", "0/points3D.bin"} <= names
-    for file in sorted(files - {Path("summary.json"), Path(".work/job.json")}):
+    # The summary and the report tell times, and the job's record the output folder.
+    for file in sorted(files - {Path("summary.json"), Path("report.html"), Path(".work/job.json")}):
         assert (first / file).read_bytes() == (second / file).read_bytes(), file
+    reported = (first / "report.html").read_bytes()
+    assert write_report(first, images_path).read_bytes() == reported
     contents = [json.loads((output / "summary.json").read_text(encoding="utf-8")) for output in (first, second)]
     for content, output in zip(contents, (first, second), strict=True):
         for key in ("seconds", "peak_memory_mib"):
