@@ -5,10 +5,11 @@ import zlib  # noqa: F401  -- must come before pycolmap
 # isort: split
 import inspect
 import re
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import colmap_vg
 from colmap_vg import options
+from colmap_vg.scene.verdicts import Verdict
 
 project = "colmap_vg"
 release = version = colmap_vg.__version__
@@ -28,16 +29,19 @@ myst_heading_anchors = 3
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # numpydoc tells types with shapes and units
-autodoc_default_options = {"members": True, "undoc-members": False}
+autodoc_default_options = {"members": True}
 numpydoc_show_class_members = False
 numpydoc_attributes_as_param_list = True
 
 
 def field_comments(option_class: type) -> list[str]:
     """Lines of a numpydoc section for the fields of an options class, whose meanings are comments in the source."""
+    hints = get_type_hints(option_class)
     pattern = re.compile(r"^    (\w+): (.+?) = (.+?)(?:  # (.+))?$", re.MULTILINE)
     lines = ["", "Parameters", "----------"]
     for name, kind, value, comment in pattern.findall(inspect.getsource(option_class)):
+        if get_origin(hints[name]) is Literal:
+            kind = "{" + ", ".join(map(repr, get_args(hints[name]))) + "}"
         number = re.fullmatch(r"_number\(([^,]+), ([^,]+)(?:, ([^,]+))?\)", value)
         if number is not None:
             default, low, high = number.groups()
@@ -47,16 +51,26 @@ def field_comments(option_class: type) -> list[str]:
             told = kind
         else:
             told = f"{kind}, default {value}"
-        lines += [f"{name} : {told}", *([f"    {comment[0].upper()}{comment[1:]}."] if comment else [])]
+        meaning = comment.replace("|", r"\|").replace("*", r"\*")
+        lines += [f"{name} : {told}", *([f"    {meaning[0].upper()}{meaning[1:]}."] if meaning else [])]
     return lines
 
 
-def describe_options(_app: object, what: str, _name: str, found: object, _options: object, lines: list[str]) -> None:
-    """Add the fields of options classes to their docstrings, before numpydoc reads these."""
-    if what == "class" and inspect.isclass(found) and found.__module__ == options.__name__:
+def words_with_reasons(verdicts: type[Verdict]) -> list[str]:
+    """Lines of a definition list of the words of an enumeration."""
+    return ["", *(line for verdict in verdicts for line in (f"``{verdict}``", f"    {verdict.reason}"))]
+
+
+def describe_members(_app: object, what: str, _name: str, found: object, _options: object, lines: list[str]) -> None:
+    """Add fields of options classes and words of verdicts to their docstrings, before numpydoc reads these."""
+    if what != "class" or not inspect.isclass(found):
+        return
+    if found.__module__ == options.__name__:
         lines += field_comments(found)
+    elif issubclass(found, Verdict):
+        lines += words_with_reasons(found)
 
 
 def setup(app: Any) -> None:
     """Connect the hooks."""
-    app.connect("autodoc-process-docstring", describe_options, priority=400)
+    app.connect("autodoc-process-docstring", describe_members, priority=400)
