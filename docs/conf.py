@@ -7,6 +7,9 @@ import inspect
 import re
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+
 import colmap_vg
 from colmap_vg import options
 from colmap_vg.scene.verdicts import Verdict
@@ -16,7 +19,7 @@ release = version = colmap_vg.__version__
 author = "the colmap_vg authors"
 copyright = author
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "numpydoc"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc"]
 exclude_patterns = ["_build"]
 templates_path = ["_templates"]
 html_theme = "furo"
@@ -24,6 +27,7 @@ html_title = f"colmap_vg {release}"
 html_copy_source = False
 
 myst_enable_extensions = ["amsmath", "dollarmath"]
+html_math_renderer = "mathml"
 myst_heading_anchors = 3
 
 autosummary_generate = True
@@ -71,6 +75,19 @@ def describe_members(_app: object, what: str, _name: str, found: object, _option
         lines += words_with_reasons(found)
 
 
+def visit_math(translator: Any, node: nodes.math) -> None:
+    """Write a formula in a line as MathML, which browsers show without a script from a network."""
+    translator.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def visit_displaymath(translator: Any, node: nodes.math_block) -> None:
+    """Write a displayed formula as MathML."""
+    translator.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>\n')
+    raise nodes.SkipNode
+
+
 def setup(app: Any) -> None:
     """Connect the hooks."""
+    app.add_html_math_renderer("mathml", (visit_math, None), (visit_displaymath, None))
     app.connect("autodoc-process-docstring", describe_members, priority=400)
