@@ -13,6 +13,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import get_args
 
+from paper.noise_ratios import NUM_RATIO_SEEDS
 from paper.position_table import PAPER_METHODS
 from paper.scenes import TABLE_1_SETS, set_conditions
 from paper.tables import SceneJob, SceneReport, measure_or_load, refuse_tables, write_tables
@@ -70,7 +71,7 @@ def main() -> None:
             [reports[job] for job in jobs],
             six_vertex_methods=methods_wanted if arguments.six_vertex_draws else (),
             num_draws=arguments.six_vertex_draws,
-            num_ratio_seeds=arguments.seeds,
+            num_ratio_seeds=1 if arguments.quick else NUM_RATIO_SEEDS,
             overwrite=arguments.overwrite,
         )
     except colmap_vg.ColmapVgError as error:

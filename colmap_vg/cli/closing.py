@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from colmap_vg.jobs.verdict_tables import image_reason
-from colmap_vg.scene.verdicts import SolutionStatus
+from colmap_vg.scene.verdicts import ImageVerdict, SolutionStatus
 
 MAX_REASONS, MAX_NAMES = 3, 3
 """Number of reasons for which images were left out, and of names for each, that are told."""
-_STATUS_REASONS = {status.value: status.reason for status in SolutionStatus}
 
 
 def closing_lines(summary: Mapping[str, Any], output_path: Path) -> list[str]:
@@ -30,13 +28,13 @@ def closing_lines(summary: Mapping[str, Any], output_path: Path) -> list[str]:
     lines = [_model_line(model, images["num_images"]) for model in summary["models"]]
     status = summary["status"]
     if status not in (SolutionStatus.SOLVED, SolutionStatus.PARTIAL):
-        lines.append(f"{status}: {_STATUS_REASONS.get(status, status)}")
+        lines.append(f"{status}: {SolutionStatus.reason_of(status)}")
     by_reason: dict[str, list[str]] = {}
     for name, verdict in images["left_out"].items():
         by_reason.setdefault(verdict, []).append(name)
     reasons = sorted(by_reason.items(), key=lambda item: (-len(item[1]), item[0]))
     for verdict, names in reasons[:MAX_REASONS]:
-        lines.append(f"{len(names)} left out ({_names(names)}): {image_reason(verdict)}")
+        lines.append(f"{len(names)} left out ({_names(names)}): {ImageVerdict.reason_of(verdict)}")
     if len(reasons) > MAX_REASONS:
         others, count = sum(len(names) for _, names in reasons[MAX_REASONS:]), len(reasons) - MAX_REASONS
         lines.append(f"{others} left out for {count} other reason{'s' if count > 1 else ''}")
@@ -49,11 +47,8 @@ def _model_line(model: Mapping[str, Any], num_images: int) -> str:
     agreement = model["agreement"]
     size = f"{model['num_images']} of {num_images} images, {model['num_points']} points"
     error = f"mean reprojection error {model['mean_reprojection_error_px']:.2f} px"
-    matches, pairs = (
-        f"{100 * agreement['inliers']:.1f} % of the matches",
-        f"{100 * agreement['pairs']:.0f} % of the pairs",
-    )
-    return f"{model['path']}: {size}, {error}, {matches} and {pairs} agree"
+    matches, pairs = 100 * agreement["inliers"], 100 * agreement["pairs"]
+    return f"{model['path']}: {size}, {error}, {matches:.1f} % of the matches and {pairs:.0f} % of the pairs agree"
 
 
 def _names(names: list[str]) -> str:

@@ -204,10 +204,10 @@ def explain_job(tables: VerdictTables, bridges: Sequence[str] = ()) -> list[str]
     lines += [f"  {told}" for told in bridges]
     left_out = [row for row in tables.images if not row.model]
     lines.append(f"not registered: {len(left_out)} of {len(tables.images)} images")
-    lines += [f"  {row.image}: {row.verdict} ({image_reason(row.verdict)})" for row in left_out]
+    lines += [f"  {row.image}: {row.verdict} ({ImageVerdict.reason_of(row.verdict)})" for row in left_out]
     lines.append(f"pairs: {len(tables.pairs)}")
     for verdict, count in Counter(row.verdict for row in tables.pairs).most_common():
-        lines.append(f"  {count} {verdict} ({edge_reason(verdict)})")
+        lines.append(f"  {count} {verdict} ({EdgeVerdict.reason_of(verdict)})")
     return lines
 
 
@@ -221,7 +221,7 @@ def explain_image(tables: VerdictTables, name: str) -> list[str]:
     """
     row = _image(tables, name)
     place = f"in model {row.model}" if row.model else "not registered"
-    lines = [f"{row.image}: {place}, {row.verdict} ({image_reason(row.verdict)})"]
+    lines = [f"{row.image}: {place}, {row.verdict} ({ImageVerdict.reason_of(row.verdict)})"]
     lines.append(f"  {row.num_kept_pairs} of its {row.num_pairs} pairs were kept")
     if row.position_sigma_percent:
         lines.append(
@@ -249,22 +249,12 @@ def explain_pair(tables: VerdictTables, name1: str, name2: str) -> list[str]:
     images = [_image(tables, name) for name in (name1, name2)]
     found = [pair for pair in tables.pairs if {pair.image1, pair.image2} == {name1, name2}]
     lines = [f"{name1} and {name2}: {_described(pair)}" for pair in found]
-    lines += [f"  {edge_reason(pair.verdict)}" for pair in found]
+    lines += [f"  {EdgeVerdict.reason_of(pair.verdict)}" for pair in found]
     if not found:
         lines = [f"{name1} and {name2}: no verified pair; too few of their features match, or they were not compared"]
     for row in images:
         lines.append(f"  {row.image}: " + (f"in model {row.model}" if row.model else f"not registered, {row.verdict}"))
     return lines
-
-
-def image_reason(word: str) -> str:
-    """Reason of a verdict on an image; for a skipped file the word itself, which is a reason already."""
-    return {str(verdict): verdict.reason for verdict in ImageVerdict}.get(word, word)
-
-
-def edge_reason(word: str) -> str:
-    """Reason of a verdict on a pair."""
-    return {str(verdict): verdict.reason for verdict in EdgeVerdict}.get(word, word)
 
 
 def _image(tables: VerdictTables, name: str) -> ImageRow:

@@ -39,8 +39,9 @@ class Factor(Protocol):
 
 class _CholeskyFactor:
     def __init__(self, matrix: Array) -> None:
+        """Factor a matrix in columns (Fortran's order) in its own memory."""
         try:
-            self._factor = scipy.linalg.cho_factor(matrix, lower=True, check_finite=False)
+            self._factor = scipy.linalg.cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
         except np.linalg.LinAlgError as error:
             raise SingularMatrixError(str(error)) from error
 
@@ -91,7 +92,7 @@ def factorize(matrix: sp.csc_array, *, check_definite: bool = False) -> Factor:
     """
     n = matrix.shape[0]
     if n <= DENSE_BELOW or (n <= DENSE_LIMIT and (matrix.nnz >= DENSE_FILL * n * n or _fills_up(matrix))):
-        return _CholeskyFactor(matrix.toarray())
+        return _CholeskyFactor(matrix.toarray(order="F"))
     return _SuperLUFactor(matrix, check_definite)
 
 

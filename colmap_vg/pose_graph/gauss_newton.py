@@ -4,7 +4,8 @@ The objectives are in :mod:`colmap_vg.pose_graph.costs`. Steps ``Q <- exp(w) Q, 
 steps on sparse 6 x 6 blocks, and Newton steps near convergence, with the first camera fixed; steps that increase the
 cost are rejected. If cost differences are below rounding, the gradient decides, so that the minimum is accurate to
 rounding and not to its square root. Newton systems are solved by conjugate gradients, preconditioned by the last
-factorisation as long as that converges fast: Alg. 2 solves hundreds of similar problems.
+factorisation as long as that converges fast. Alg. 2 solves hundreds of similar problems: near the minimum of the last
+one, steps with an old factorisation need gradients alone (:meth:`PoseGraphSolver.solve_nearby`).
 """
 
 from collections.abc import Iterator
@@ -178,9 +179,15 @@ class PoseGraphSolver:
         return None
 
     def _refactored(self, cost: PoseGraphCost, Q: Array, p: Array) -> Factor | None:
-        """Factor the exact Hessian at given poses; None if it is not positive definite or the cost has none."""
-        self._stale = None
-        self._newton_step(self._linearize(cost, Q, p))
+        """Factor the exact Hessian at given poses, Gauss-Newton's if the cost has no other; None if not definite."""
+        at, self._stale = self._linearize(cost, Q, p), None
+        if at.terms.curvature_ii is not None:
+            self._newton_step(at)
+            return self._stale
+        try:
+            self._stale = factorize(self._matrix(at, at.terms.ii, at.terms.jj, at.terms.ij, MIN_DAMPING))
+        except SingularMatrixError:
+            return None
         return self._stale
 
     def _sum(self, gradient_i: Array, gradient_j: Array) -> Array:

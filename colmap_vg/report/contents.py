@@ -16,10 +16,10 @@ from colmap_vg.jobs.verdict_tables import ImageRow, PairRow, read_tables
 from colmap_vg.report.matches import MAX_MATCHES, pair_matches
 from colmap_vg.report.models import MAX_POINTS, ModelView, model_view, read_model
 from colmap_vg.report.thumbnails import MANY, MAX_THUMBNAILS, PREVIEW_SIDE, SIDE, SMALL_SIDE, thumbnails
+from colmap_vg.scene.verdicts import USED_EDGES
 
 MAX_PAIRS, MAX_MODELS, NUM_WORST = 20_000, 20, 24
 """Maximum number of pairs and of models shown, and number of pairs whose matches are shown."""
-USED = ("kept", "rotation_only")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +108,8 @@ def _shown_pairs(pairs: Sequence[PairRow], notes: list[str]) -> tuple[PairRow, .
         f"{MAX_PAIRS:,} of {len(pairs):,} pairs are shown: all pairs that were not used, as far as there is"
         " room, and of the others evenly spread ones. pairs.csv lists all."
     )
-    unused = [index for index, pair in enumerate(pairs) if pair.verdict not in USED]
-    used = [index for index, pair in enumerate(pairs) if pair.verdict in USED]
+    unused = [index for index, pair in enumerate(pairs) if pair.verdict not in USED_EDGES]
+    used = [index for index, pair in enumerate(pairs) if pair.verdict in USED_EDGES]
     room = max(MAX_PAIRS - len(unused), MAX_PAIRS // 2)
     chosen = _spread(used, room)
     chosen += _spread(unused, MAX_PAIRS - len(chosen))
@@ -131,7 +131,7 @@ def _worst_matches(
         notes.append("Without the database, no matches are shown.")
         return {}
     worst = sorted(range(len(pairs)), key=lambda k: -error_deg(pairs[k]))
-    used = [k for k in worst if pairs[k].verdict in USED][: NUM_WORST // 2]
+    used = [k for k in worst if pairs[k].verdict in USED_EDGES][: NUM_WORST // 2]
     chosen = used + [k for k in worst if k not in used][: NUM_WORST - len(used)]
     try:
         found = pair_matches(database_path, [(pairs[k].image1, pairs[k].image2) for k in chosen])

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from colmap_vg.jobs.verdict_tables import ImageRow, edge_reason, image_reason
+from colmap_vg.jobs.verdict_tables import ImageRow
 from colmap_vg.report.contents import Contents
-from colmap_vg.scene.verdicts import SolutionStatus
+from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
 
 
 @dataclass(frozen=True)
@@ -90,15 +90,14 @@ def overview(contents: Contents) -> Overview:
     """
     summary = contents.summary
     status = str(summary["status"])
-    reasons = {str(word): word.reason for word in SolutionStatus}
     edges: Mapping[str, Any] = summary["edges"]
     used = ("used", "used by the solution", int(edges["num_kept"]))
-    dropped = [(word, edge_reason(word), int(count)) for word, count in edges["dropped"].items()]
+    dropped = [(word, EdgeVerdict.reason_of(word), int(count)) for word, count in edges["dropped"].items()]
     return Overview(
         str(summary["verb"]),
         str(summary["version"]),
         status,
-        reasons.get(status, ""),
+        SolutionStatus.reason_of(status),
         status in (SolutionStatus.DOUBTFUL, SolutionStatus.NOT_CONVERGED, SolutionStatus.UNSOLVABLE),
         len(contents.images),
         sum(bool(row.model) for row in contents.images),
@@ -146,7 +145,7 @@ def _removed(images: Sequence[ImageRow]) -> tuple[Group, ...]:
     for row in images:
         if not row.model:
             names[row.verdict].append(row.image)
-    groups = [Group(word, image_reason(word), len(own), tuple(own)) for word, own in names.items()]
+    groups = [Group(word, ImageVerdict.reason_of(word), len(own), tuple(own)) for word, own in names.items()]
     return tuple(sorted(groups, key=lambda group: -group.count))
 
 

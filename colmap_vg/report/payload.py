@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.jobs.verdict_tables import edge_reason, image_reason
-from colmap_vg.report.contents import USED, Contents
+from colmap_vg.report.contents import Contents
 from colmap_vg.report.models import ModelView
+from colmap_vg.scene.verdicts import USED_EDGES, EdgeVerdict, ImageVerdict
 
 _ESCAPES = {ord(character): f"\\u{ord(character):04x}" for character in "<>&\u2028\u2029"}
 
@@ -38,9 +38,9 @@ def payload(contents: Contents) -> dict[str, Any]:
             "direction": [_number(pair.direction_error_deg) for pair, _, _ in pairs],
             "sigmas": [_number(pair.sigmas) for pair, _, _ in pairs],
         },
-        "imageReasons": {word: image_reason(word) for word in {row.verdict for row in contents.images}},
-        "pairReasons": {word: edge_reason(word) for word in {pair.verdict for pair in contents.pairs}},
-        "used": list(USED),
+        "imageReasons": {word: ImageVerdict.reason_of(word) for word in {row.verdict for row in contents.images}},
+        "pairReasons": {word: EdgeVerdict.reason_of(word) for word in {pair.verdict for pair in contents.pairs}},
+        "used": list(USED_EDGES),
         "models": [_model(view) for view in contents.models],
         "matches": {str(pair): np.round(match, 4).tolist() for pair, match in contents.matches.items()},
     }

@@ -16,6 +16,11 @@ class Verdict(StrEnum):
         member.reason = reason
         return member
 
+    @classmethod
+    def reason_of(cls, word: str) -> str:
+        """Reason of a word; a text that is no word of this kind is its own reason, as of a file that was skipped."""
+        return {str(verdict): verdict.reason for verdict in cls}.get(word, word)
+
 
 class EdgeVerdict(Verdict):
     """Whether an edge (a verified image pair) was used, or why not."""
@@ -43,6 +48,10 @@ class EdgeVerdict(Verdict):
     )
     REVERSED = "reversed", "its direction points away from the solved one"
     OUTSIDE = "outside_component", "it is outside the solved part, or links two models"
+
+
+USED_EDGES = (EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY)
+"""Verdicts on edges that the solution uses."""
 
 
 class ImageVerdict(Verdict):

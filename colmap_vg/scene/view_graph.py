@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.errors import GraphError
-from colmap_vg.scene.verdicts import EdgeVerdict
+from colmap_vg.scene.verdicts import USED_EDGES, EdgeVerdict
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -133,7 +133,7 @@ class ViewGraph:
         """Mask (m,) of the edges whose rotation may be used."""
         if self.read_verdicts is None:
             return np.ones(self.num_edges, dtype=bool)
-        return np.isin(self.read_verdicts, [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
+        return np.isin(self.read_verdicts, USED_EDGES)
 
     @property
     def has_direction(self) -> BoolArray:

@@ -40,6 +40,7 @@ def filter_directions(
     rigid = fixed_part(state, part, options)
     if rigid.num_images < 3 or options.outlier_filter == "none":
         return rigid, None
+    centers = None
     own = rotations[part.rows_of(rigid.images)]
     directions = world_directions(state.graph, rigid, own)
     if options.outlier_filter == "1dsfm":
@@ -51,9 +52,8 @@ def filter_directions(
         weights = edge_weights(state.graph, rigid.edge_rows, options) * _rotation_trust(state.graph, rigid, own)
         centers, angles = robust_direction_residuals(rigid.num_images, rigid.edges, directions, weights)
         state.drop(rigid.edge_rows[angles > np.radians(options.direction_gate_deg)], EdgeVerdict.DIRECTION_OUTLIER)
-        fixed = fixed_part(state, rigid, options)
-        return fixed, centers[rigid.rows_of(fixed.images)]
-    return fixed_part(state, rigid, options), None
+    fixed = fixed_part(state, rigid, options)
+    return fixed, None if centers is None else centers[rigid.rows_of(fixed.images)]
 
 
 def fixed_part(state: SolverState, part: Subgraph, options: SolveOptions) -> Subgraph:

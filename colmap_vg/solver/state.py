@@ -8,7 +8,7 @@ from colmap_vg.scene.components import components_by_size
 from colmap_vg.scene.edge_residuals import graph_residual_sigmas
 from colmap_vg.scene.solution import Agreement, LogEntry, PoseSolution
 from colmap_vg.scene.subgraph import Subgraph
-from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
+from colmap_vg.scene.verdicts import USED_EDGES, EdgeVerdict, ImageVerdict, SolutionStatus
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.solver.agreement import pair_agreement
 from colmap_vg.solver.rigidity import largest_rigid_component
@@ -60,7 +60,7 @@ class SolverState:
     @property
     def usable(self) -> BoolArray:
         """Mask (m,) of the edges that no test has dropped."""
-        return np.isin(self.edge_verdicts.astype(str), [EdgeVerdict.KEPT, EdgeVerdict.ROTATION_ONLY])
+        return np.isin(self.edge_verdicts.astype(str), USED_EDGES)
 
     @property
     def trusted(self) -> BoolArray:

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 NOISE_RATIOS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviation of directions over that of rotations, in each axis."""
 ROTATION_DEG = 1.0
+NUM_RATIO_SEEDS = 5
 NUM_IMAGES, NUM_NEIGHBORS = 40, 6
 """Images on a ring, and the following images on it that each is linked to."""
 

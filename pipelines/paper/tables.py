@@ -22,7 +22,7 @@ from colmap_vg.options import Method
 from colmap_vg.simulation.six_vertices import SIX_CENTERS, SIX_EDGES
 from paper.figures import EdgeErrors, edge_errors, scale_factors, shares_outside
 from paper.markdown import csv_text, markdown_table
-from paper.noise_ratios import NOISE_RATIOS, ROTATION_DEG, errors_by_ratio
+from paper.noise_ratios import NOISE_RATIOS, NUM_RATIO_SEEDS, ROTATION_DEG, errors_by_ratio
 from paper.plots import bars_svg, histogram_svg, lines_svg, points_svg
 from paper.position_table import MethodErrors, solve_with, table_1, wins
 from paper.scenes import KnownScene, real_scene, set_conditions, simulated_scene
@@ -137,7 +137,7 @@ def write_tables(
     *,
     six_vertex_methods: Sequence[Method],
     num_draws: int = 500,
-    num_ratio_seeds: int = 5,
+    num_ratio_seeds: int = NUM_RATIO_SEEDS,
     overwrite: bool = False,
 ) -> Path:
     """Write Markdown, CSV and SVG to ``output_path/tables``, whole or not at all.

@@ -9,7 +9,7 @@ from colmap_vg import align_positions
 from colmap_vg.geometry import so3
 from colmap_vg.metrics import rotation_errors
 from colmap_vg.pose_graph.alternation import solve_joint
-from colmap_vg.pose_graph.gauss_newton import solve_pose_graph
+from colmap_vg.pose_graph.gauss_newton import PoseGraphSolver, solve_pose_graph
 from colmap_vg.positions.cls import solve_cls
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.simulation.ring_scenes import ring_scene
@@ -173,3 +173,13 @@ def test_the_choice_of_world_and_the_order_do_not_matter(seed, approach):
     assert errors.max() < 1e-7 * np.abs(a.projection_centers).max()
     between = _relative_to_first(a.cam_from_world_rotations) - _relative_to_first(b.cam_from_world_rotations[row])
     assert np.abs(between).max() < 1e-7
+
+
+def test_inner_problems_near_the_fixed_point_take_no_newton_steps(monkeypatch):
+    _, arguments = _started(25, rotation_sigma=0.03, direction_sigma=0.1, seed=1)
+    solved = []
+    newton = PoseGraphSolver.solve
+    monkeypatch.setattr(PoseGraphSolver, "solve", lambda *a, **k: solved.append(1) or newton(*a, **k))
+    result = solve_joint(*arguments, "C", tolerance=1e-9)
+    assert result.converged
+    assert 1 <= len(solved) < result.num_iterations / 3

@@ -147,12 +147,12 @@ def test_cost_never_rises_and_the_end_is_quadratic():
     assert len(log) < 15
 
 
-def test_an_old_factorisation_reaches_the_minimum_of_a_similar_problem():
+@pytest.mark.parametrize("kind", ["chordal", "information"])
+def test_an_old_factorisation_reaches_the_minimum_of_a_similar_problem(kind):
     R, p, edges, relative, translations = _pose_graph(20, rotation_sigma=0.05, translation_sigma=0.05)
-    kappa, tau = np.random.default_rng(0).uniform(0.5, 2.0, (2, len(edges)))
     solver, Q = PoseGraphSolver(20, edges), np.swapaxes(R, 1, 2)
-    Q, p, _ = solver.solve(ChordalCost(edges, relative, translations, kappa, tau), Q, p)
-    similar = ChordalCost(edges, relative, 1.02 * translations, kappa, tau)
+    Q, p, _ = solver.solve(_costs(edges, relative, translations)[kind], Q, p)
+    similar = _costs(edges, relative, 1.02 * translations)[kind]
     near_Q, near_p = solver.solve_nearby(similar, Q, p, 1.0, 1e-11)
     exact_Q, exact_p, _ = PoseGraphSolver(20, edges).solve(similar, Q, p)
     assert np.abs(near_p - p).max() > 1e-2

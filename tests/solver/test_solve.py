@@ -23,6 +23,7 @@ from colmap_vg.geometry.directions import normalized
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.ring_scenes import ring_scene
 from colmap_vg.simulation.views import synthetic_views
+from colmap_vg.solver import position_stage
 
 PAPER = {"rotation_averaging": "chordal", "rotation_gate_deg": 0.0, "outlier_filter": "none"}
 METHODS = ["1C", "1O", "2C", "2O"]
@@ -268,3 +269,14 @@ def test_random_edges_without_matches_are_solved(sigma_deg, outlier_share, bound
     assert solution.status == "solved"
     errors, _ = align_positions(solution.projection_centers, p)
     assert np.median(errors) < bound * np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1)))
+
+
+def test_positions_without_matches_start_from_the_robust_filter(monkeypatch):
+    def refuse(*_args, **_options):
+        raise AssertionError("CLS repeats what the filter has solved")
+
+    _, graph = _random_view_graph(40, 12, np.radians(1.0), 0.2)
+    monkeypatch.setattr(position_stage, "solve_cls", refuse)
+    assert solve_view_graph(graph).status == "solved"
+    with pytest.raises(AssertionError, match="CLS repeats"):  # without the filter there is no other start
+        solve_view_graph(graph, SolveOptions(outlier_filter="none"))
