@@ -29,7 +29,10 @@ def test_a_job_names_its_report_at_the_end(database_path: Path, tmp_path: Path) 
     result = invoke(*job)
     assert result.exit_code == 0, result.output
     report = tmp_path / "out" / "report.html"
-    assert result.output.splitlines()[-1] == f"report: {report}"
+    *_, said, named = result.output.splitlines()
+    assert said.startswith(f"{tmp_path / 'out' / '0'}: 5 of 5 images, ")
+    assert said.endswith(" of the pairs agree")
+    assert named == f"report: {report}"
     assert report.stat().st_size > 0
     assert "nothing is left to do" in invoke(*job, "--resume").output
     report.unlink()
