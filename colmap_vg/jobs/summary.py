@@ -122,7 +122,7 @@ def told_bridges(output_path: Path) -> list[str]:
 
 
 def plain(value: object) -> object:
-    """Convert a value to JSON's types."""
+    """Convert a value to JSON's types; paths become absolute, for readers that start elsewhere."""
     if is_dataclass(value) and not isinstance(value, type):
         return {name: plain(item) for name, item in asdict(value).items()}
     if isinstance(value, Mapping):
@@ -133,4 +133,4 @@ def plain(value: object) -> object:
         return plain(value.value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    return os.fspath(value) if isinstance(value, os.PathLike) else str(value)
+    return str(Path(value).absolute()) if isinstance(value, os.PathLike) else str(value)

@@ -92,3 +92,14 @@ def test_a_report_that_fails_leaves_the_model(
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert "The report was not written: the disk is full" in summary["warnings"]
     assert "nothing is left to do" in invoke(*job, "--resume").output
+
+
+def test_relative_inputs_are_found_from_another_folder(
+    database_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(database_path.parent)
+    job = ("mapper", "--database_path", database_path.name, "--output_path", tmp_path / "out", "--report", "0")
+    assert invoke(*job).exit_code == 0
+    monkeypatch.chdir(tmp_path)
+    assert invoke("report", "--output_path", "out").exit_code == 0
+    assert "Without the database" not in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

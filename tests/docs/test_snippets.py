@@ -1,5 +1,6 @@
 """Commands and Python snippets of README, CONTRIBUTING and docs run, or are parsed as their programs would."""
 
+import json
 import os
 import re
 import shlex
@@ -12,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from synthetic_databases import changed_copy, make_database
 from typer.main import get_command
@@ -20,6 +22,7 @@ from colmap_vg.cli import colmap_flags
 from colmap_vg.cli.jobs import mapper
 from colmap_vg.cli.main import app
 from colmap_vg.cli.reporter import Reporter
+from colmap_vg.demo import render_photographs
 from colmap_vg.options import MappingOptions
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
 
@@ -39,11 +42,8 @@ NOT_RUN = {
 }
 """Programs whose commands are neither run nor parsed, and why."""
 
-ONLY_PARSED = {
-    "run": "extracts features of photographs, which are blank here; tests/features does it",
-    "demo": "renders for half a minute; tests/demo does it",
-}
-"""Verbs whose commands are parsed but not run, and why. Scripts of pipelines/ are only parsed: they need data."""
+NEED_PHOTOGRAPHS = ("run", "demo")
+"""Verbs whose commands run on rendered photographs. Scripts of pipelines/ are only parsed: they need data."""
 
 OTHER_PROGRAMS_FLAGS = {
     "pytest": ("--benchmark-only",),
@@ -86,6 +86,7 @@ def commands() -> list[tuple[str, list[str]]]:
 
 
 OURS = [(page, words[1:]) for page, words in commands() if words[0] == "colmap-vg"]
+WITH_PHOTOGRAPHS = sorted({tuple(words) for _, words in OURS if words[0] in NEED_PHOTOGRAPHS})
 SCRIPTS = [(page, words[1:]) for page, words in commands() if words[0] == "python"]
 SNIPPETS = [(f"{page.name}-{k}", text) for page in PAGES for k, text in enumerate(blocks(page, "python"))]
 
@@ -163,12 +164,26 @@ def test_wrong_commands_do_not_parse(words: list[str]) -> None:
 
 @pytest.mark.parametrize(
     ("page", "words"),
-    [(page, words) for page, words in OURS if words[0] not in ONLY_PARSED],
+    [(page, words) for page, words in OURS if words[0] not in NEED_PHOTOGRAPHS],
     ids=lambda value: value if isinstance(value, str) else value[0],
 )
 def test_commands_run(page: str, words: list[str], workplace: Path) -> None:
     output = run_in(workplace, "-m", "colmap_vg", *words)
     assert output or words[0] != "explain"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", WITH_PHOTOGRAPHS, ids=" ".join)
+def test_commands_on_photographs_run(words: tuple[str, ...], tmp_path: Path) -> None:
+    if words[0] != "demo":
+        (tmp_path / "photos").mkdir()
+        render_photographs(tmp_path / "photos", num_images=6)
+    output = run_in(tmp_path, "-m", "colmap_vg", *words)
+    folder = tmp_path / words[words.index("--output_path") + 1]
+    assert f"report: {folder.name}/report.html\n" in output
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["images"]["left_out"] == {}
+    assert pycolmap.Reconstruction(folder / "0").num_reg_images() == summary["images"]["num_images"]
 
 
 @pytest.mark.parametrize(("page", "words"), SCRIPTS, ids=lambda value: value if isinstance(value, str) else value[0])

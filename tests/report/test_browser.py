@@ -2,11 +2,12 @@
 
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from report_outputs import HOSTILE_NAMES, hostile_job
+from report_outputs import HOSTILE_NAMES, hostile_job, two_models_job
 
 from colmap_vg.report.page import write_report
 
@@ -38,9 +39,10 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_report(hostile_job(tmp_path_factory.mktemp("hostile")))
 
 
-@pytest.fixture
-def page(browser: Any, report: Path) -> Iterator[Any]:
-    page = browser.new_page(viewport={"width": 1300, "height": 900})
+@contextmanager
+def opened(browser: Any, report: Path, **options: object) -> Iterator[Any]:
+    """A page of the browser with the report, which asks for nothing and has no error."""
+    page = browser.new_page(**options)
     problems: list[str] = []
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
@@ -51,6 +53,12 @@ def page(browser: Any, report: Path) -> Iterator[Any]:
     yield page
     page.close()
     assert not problems
+
+
+@pytest.fixture
+def page(browser: Any, report: Path) -> Iterator[Any]:
+    with opened(browser, report, viewport={"width": 1300, "height": 900}) as page:
+        yield page
 
 
 def test_filters_change_the_number_of_pairs(page: Any) -> None:
@@ -94,9 +102,20 @@ def test_a_click_in_the_view_selects_an_image(page: Any) -> None:
 
 
 def test_a_phone_needs_no_scrolling_sideways(browser: Any, report: Path) -> None:
-    page = browser.new_page(viewport={"width": 390, "height": 800}, color_scheme="dark")
-    page.goto(report.as_uri())
-    page.wait_for_function("document.documentElement.dataset.ready === '1'")
-    assert page.evaluate("document.documentElement.dataset.theme") == "dark"
-    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
-    page.close()
+    with opened(browser, report, viewport={"width": 390, "height": 800}, color_scheme="dark") as page:
+        assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+        assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+
+
+def test_each_model_has_its_view(browser: Any, tmp_path: Path) -> None:
+    with opened(browser, write_report(two_models_job(tmp_path))) as page:
+        counts, first = [], []
+        for model in ("0", "1"):
+            page.select_option("#model", model)
+            counts.append(page.inner_text("#count"))
+            first.append(page.evaluate("document.getElementById('model-view').data[2].customdata"))
+        assert counts == ["15 of 15 pairs shown"] * 2
+        assert sorted(first[0] + first[1]) == list(range(12))
+        other = page.locator(f"#images-table tr[data-row='{first[0][0]}']")
+        other.click()  # of the model that is not shown
+        assert page.inner_text("#selected .title") == other.locator("td").first.inner_text()

@@ -18,7 +18,7 @@ from colmap_vg.options import MappingOptions
 HOSTILE_NAMES = (
     "<script>alert(1)</script>.jpg",
     "\"quoted\" 'twice' </textarea> &amp; {{ 7*7 }}.jpg",
-    "x" * 240 + ".jpg",
+    "x" * 200 + "/" + "y" * 96 + ".jpg",  # 301 characters
     "Größe 日本 \u2028 \u202e.jpg",
     "two\nlines.jpg",
     "<img src=x onerror=alert(1)>",
@@ -45,6 +45,20 @@ def hostile_job(folder: Path) -> Path:
     for name in (HOSTILE_NAMES[3], HOSTILE_NAMES[4]):
         (photographs / name).write_bytes(encoded.tobytes())
     mapper(database, photographs, folder / "out", MappingOptions(), False, Reporter(quiet=True), with_report=False)
+    return folder / "out"
+
+
+def two_models_job(folder: Path) -> Path:
+    """The output folder of a mapping job on twelve images, no pair of which links the first six with the others."""
+    make_database(folder / "original.db", num_images=12, num_points=300, noise_px=0.5)
+    first, second = "pair_id / 2147483647", "pair_id % 2147483647"
+    cut = f"DELETE FROM {{}} WHERE ({first} <= 6) != ({second} <= 6)"
+    database = changed_copy(
+        folder / "original.db",
+        folder / "database.db",
+        *((cut.format(table), ()) for table in ("two_view_geometries", "matches")),
+    )
+    mapper(database, None, folder / "out", MappingOptions(), False, Reporter(quiet=True), with_report=False)
     return folder / "out"
 
 

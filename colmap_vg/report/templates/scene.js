@@ -25,13 +25,21 @@ function errorOf(pair) {
   return byId("edge-color").value === "direction" ? pairs.direction[pair] : pairs.rotation[pair];
 }
 
+// The pairs that the filters keep; where a maximum error is set, also how many have no known error.
 function filtered() {
   const wanted = new Set([...document.querySelectorAll("#verdicts input:checked")].map((box) => box.value));
   const least = Number(byId("min-inliers").value) || 0;
   const text = byId("max-error").value;
   const most = text === "" ? Infinity : Number(text);
-  return pairsOfModel().filter((k) => wanted.has(pairs.verdict[k]) && (pairs.inliers[k] ?? Infinity) >= least &&
-    (most === Infinity || (errorOf(k) !== null && errorOf(k) <= most)));
+  const found = pairsOfModel().filter((k) => wanted.has(pairs.verdict[k]) && (pairs.inliers[k] ?? Infinity) >= least);
+  if (most === Infinity) return [found, 0];
+  const known = found.filter((k) => errorOf(k) !== null);
+  return [known.filter((k) => errorOf(k) <= most), found.length - known.length];
+}
+
+function describeCount(shown, unknown) {
+  const hidden = unknown ? `; ${unknown.toLocaleString("en")} hidden, whose error is unknown` : "";
+  return `${shown.toLocaleString("en")} of ${pairsOfModel().length.toLocaleString("en")} pairs shown${hidden}`;
 }
 
 function columns() {
@@ -78,7 +86,8 @@ function cameraTraces(model) {
 
 function edgeTraces(model) {
   const lines = columns(), middles = columns(), colors = [], dots = [], inside = places();
-  view.shown = filtered();
+  const [shown, unknown] = filtered();
+  view.shown = shown;
   const choice = byId("edge-color").value;
   byId("error-legend").hidden = choice === "verdict";
   for (const k of view.shown) {
@@ -91,8 +100,7 @@ function edgeTraces(model) {
     push(middles, a.map((value, axis) => (value + b[axis]) / 2));
     dots.push(color);
   }
-  byId("count").textContent = `${view.shown.length.toLocaleString("en")} of ` +
-    `${pairsOfModel().length.toLocaleString("en")} pairs shown`;
+  byId("count").textContent = describeCount(shown.length, unknown);
   const visible = byId("show-pairs").checked;
   const many = view.shown.length > 400;
   return [
