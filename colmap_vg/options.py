@@ -148,6 +148,7 @@ class MappingOptions(_Checked):
     ba_refine_extra_params: bool = True
     share_cameras: bool = True  # share intrinsics between images of the same size and initial calibration
     extract_colors: bool = True
+    use_prior_position: bool = True  # georeference models by the measured positions in the database
     overwrite: bool = False
     num_threads: int = _number(-1, -1)  # -1: all cores
     random_seed: int = _number(0, 0)  # of all stages; replaces those of read and solve

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from colmap_vg.jobs.summary import georeference_line
 from colmap_vg.scene.verdicts import ImageVerdict, SolutionStatus
 
 MAX_REASONS, MAX_NAMES = 3, 3
@@ -25,7 +26,11 @@ def closing_lines(summary: Mapping[str, Any], output_path: Path) -> list[str]:
     list of str
     """
     images = summary["images"]
-    lines = [_model_line(model, images["num_images"]) for model in summary["models"]]
+    lines = []
+    for model in summary["models"]:
+        lines.append(_model_line(model, images["num_images"]))
+        if model.get("georeference"):
+            lines.append(georeference_line(model["georeference"]))
     status = summary["status"]
     if status not in (SolutionStatus.SOLVED, SolutionStatus.PARTIAL):
         lines.append(f"{status}: {SolutionStatus.reason_of(status)}")

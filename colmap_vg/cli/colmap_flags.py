@@ -24,6 +24,7 @@ REFINE_EXTRA_PARAMS = (
     "--GlobalMapper.ba_refine_extra_params",
 )
 REFINE_INTRINSICS = ("--BundleAdjustment.optimize_intrinsics",)
+USE_PRIOR_POSITION = ("--use_prior_position", "--Mapper.use_prior_position", "--PosePrior.use_pose_position_prior")
 EXTRACT_COLORS = ("--extract_colors", "--Mapper.extract_colors")
 NUM_THREADS = ("--num_threads", "--Mapper.num_threads", "--GlobalMapper.num_threads")
 RANDOM_SEED = ("--random_seed", "--seed", "--Mapper.random_seed", "--GlobalMapper.random_seed")
@@ -41,6 +42,8 @@ _IGNORED = {
         image_list_path constraint_type ba_iteration_num retriangulation_iteration_num output_format
         skip_preprocessing skip_view_graph_calibration skip_relative_pose_estimation skip_rotation_averaging
         skip_track_establishment skip_global_positioning skip_bundle_adjustment skip_retriangulation skip_pruning
+        prior_position_std_x prior_position_std_y prior_position_std_z overwrite_priors_covariance
+        use_robust_loss_on_prior_position prior_position_loss_scale
         """,
     "Mapper.": """
         ignore_watermarks multiple_models max_num_models max_model_overlap min_model_size init_image_id1 init_image_id2
@@ -57,7 +60,7 @@ _IGNORED = {
         init_min_tri_angle init_max_reg_trials abs_pose_max_error abs_pose_min_num_inliers abs_pose_min_inlier_ratio
         abs_pose_refine_focal_length abs_pose_refine_extra_params filter_max_reproj_error filter_min_tri_angle
         max_reg_trials local_ba_min_tri_angle image_selection_method image_list_path constant_rig_list_path
-        constant_camera_list_path max_runtime_seconds use_prior_position use_robust_loss_on_prior_position
+        constant_camera_list_path max_runtime_seconds use_robust_loss_on_prior_position
         prior_position_loss_scale load_all_images tri_max_transitivity tri_create_max_angle_error
         tri_continue_max_angle_error tri_merge_max_reproj_error tri_complete_max_reproj_error
         tri_complete_max_transitivity tri_re_max_angle_error tri_re_min_ratio tri_re_max_trials tri_min_angle
@@ -91,7 +94,7 @@ _IGNORED = {
         max_epipolar_error_H min_inlier_ratio
         """,
     "PosePrior.": """
-        use_pose_position_prior prior_position_std_x prior_position_std_y prior_position_std_z
+        prior_position_std_x prior_position_std_y prior_position_std_z
         overwrite_priors_covariance use_robust_loss_on_prior_position prior_position_loss_threshold
         prior_position_scaled_loss_factor alignment_ransac_max_error
         """,
@@ -105,6 +108,7 @@ OBEYED = (
     *REFINE_PRINCIPAL_POINT,
     *REFINE_EXTRA_PARAMS,
     *REFINE_INTRINSICS,
+    *USE_PRIOR_POSITION,
     *EXTRACT_COLORS,
     *NUM_THREADS,
     *RANDOM_SEED,

@@ -222,6 +222,13 @@ class ModelFlags:
             help="Share intrinsics between images with the same initial calibration, unless they show different ones.",
         ),
     ] = "1"
+    use_prior_position: Annotated[
+        Switch,
+        _switch(
+            *colmap_flags.USE_PRIOR_POSITION,
+            help="Georeference models by the GPS or other measured positions in the database.",
+        ),
+    ] = "1"
     extract_colors: Annotated[
         Switch, _switch(*colmap_flags.EXTRACT_COLORS, help="Colour points from the photographs.")
     ] = "1"

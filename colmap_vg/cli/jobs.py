@@ -230,7 +230,8 @@ def _finish(
     content = job_summary(verb, asked, reporter.records, reporter.warnings)
     content |= _verdicts(mapped.graph, mapped.solution, output_path, skipped or {}, mapped.weak_cuts)
     content["models"] = [
-        model_summary(output_path / str(index), model) | {"agreement": plain(mapped.solution.agreement[index])}
+        model_summary(output_path / str(index), model)
+        | {"agreement": plain(mapped.solution.agreement[index]), "georeference": plain(mapped.georeferences[index])}
         for index, model in mapped.models.items()
     ]
     content |= further or {}

@@ -27,6 +27,7 @@ from colmap_vg.mapping.build import (
     build_model,
 )
 from colmap_vg.mapping.colors import extract_colors
+from colmap_vg.mapping.georeference import Georeference, georeference
 from colmap_vg.mapping.join import Joint, joined_poses, joint_of
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
@@ -62,12 +63,15 @@ class MappingResult:
         edge verdicts, radial terms and covariances are those of the viewing graph's solution.
     weak_cuts : tuple of tuples of WeakCut
         For each model, the cuts that few pairs cross.
+    georeferences : tuple of Georeference or None
+        Of each model that lies in the frame of measured positions.
     """
 
     models: dict[int, "pycolmap.Reconstruction"]
     graph: ViewGraph
     solution: PoseSolution
     weak_cuts: tuple[tuple[WeakCut, ...], ...] = ()
+    georeferences: tuple[Georeference | None, ...] = ()
 
 
 def view_graph_mapping(
@@ -156,7 +160,8 @@ def map_database(
         with log.stage("write"):
             staged = stage_models(work, len(built))
             for folder, model in zip(staged, built, strict=True):
-                model.reconstruction.normalize()
+                if model.georeference is None:
+                    model.reconstruction.normalize()
                 if options.extract_colors:
                     extract_colors(model.reconstruction, image_path, log)
                 write_model(model.reconstruction, folder)
@@ -166,7 +171,7 @@ def map_database(
     finished = solution_of_models(
         solution, graph, [model.reconstruction for model in built], [model.result for model in built], cuts
     )
-    return MappingResult(models, graph, finished, cuts)
+    return MappingResult(models, graph, finished, cuts, tuple(model.georeference for model in built))
 
 
 @dataclass(frozen=True)
@@ -175,6 +180,7 @@ class _Model:
 
     reconstruction: "pycolmap.Reconstruction"
     result: BuildResult
+    georeference: Georeference | None = None
 
 
 def _build(
@@ -220,7 +226,24 @@ def _build(
                 replace(m, reconstruction=_with_database_cameras(cache, m.reconstruction, replaced, options, log))
                 for m in models
             ]
-    return sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
+    models = sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
+    return _georeferenced(cache, models, graph, options, log)
+
+
+def _georeferenced(
+    cache: "pycolmap.DatabaseCache", models: list[_Model], graph: ViewGraph, options: MappingOptions, log: StageLog
+) -> list[_Model]:
+    """Move models to the frame of their measured positions, if there are any and they are wanted."""
+    priors = graph.priors
+    if not options.use_prior_position or priors is None or not priors.has_position.any():
+        return models
+    with log.stage("georeference"):
+        placed = [
+            replace(m, georeference=georeference(cache, m.reconstruction, priors, graph.image_ids, options, log))
+            for m in models
+        ]
+        log.result(f"{sum(m.georeference is not None for m in placed)} of {len(models)} models georeferenced")
+        return placed
 
 
 def _joined(

@@ -71,6 +71,21 @@ def model_summary(path: Path, model: "pycolmap.Reconstruction") -> dict[str, obj
     }
 
 
+def georeference_line(told: Mapping[str, Any]) -> str:
+    """Sentence on the frame of a georeferenced model, and on the measured positions.
+
+    >>> georeference_line({"origin": [47.3, 8.5, 440.0], "sigmas": [3.1, 3.1, 4.8], "outliers": ["a"],
+    ...                    "residuals": {"a": [], "b": [], "c": [], "d": []}})
+    'metres east, north and up of 47.3, 8.5 (WGS84, height 440 m); positions measured to 3.1, 3.1, 4.8; 1 of 4 is wrong'
+    """
+    origin, wrong, count = told["origin"], len(told["outliers"]), len(told["residuals"])
+    frame = "in the frame of the measured positions"
+    if origin is not None:
+        frame = f"metres east, north and up of {origin[0]}, {origin[1]} (WGS84, height {origin[2]:g} m)"
+    precision = ", ".join(f"{sigma:.2g}" for sigma in told["sigmas"])
+    return f"{frame}; positions measured to {precision}; {wrong} of {count} {'is' if wrong == 1 else 'are'} wrong"
+
+
 def write_summary(output_path: Path, content: Mapping[str, object]) -> None:
     """Write ``summary.json`` atomically.
 

@@ -4,6 +4,7 @@ pycolmap does the heavy work. The given poses are nearly right, so one short rou
 a mapper that starts from rough poses needs many.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,6 +167,7 @@ def adjust_once_more(
     options: MappingOptions,
     *,
     trial: bool = False,
+    priors: Sequence["pycolmap.PosePrior"] = (),
 ) -> float:
     """Run one more round of bundle adjustment on a finished model, in place.
 
@@ -176,6 +178,8 @@ def adjust_once_more(
     options : MappingOptions
     trial : bool
         Only the cost is asked for: the adjustment ends early.
+    priors : sequence of pycolmap.PosePrior, optional
+        See :func:`adjust_bundle`.
 
     Returns
     -------
@@ -184,15 +188,21 @@ def adjust_once_more(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    share = _adjust(mapper, options, trial=trial)
+    share = _adjust(mapper, options, trial=trial, priors=priors)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return share
 
 
-def _adjust(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, *, trial: bool = False) -> float:
+def _adjust(
+    mapper: "pycolmap.IncrementalMapper",
+    options: MappingOptions,
+    *,
+    trial: bool = False,
+    priors: Sequence["pycolmap.PosePrior"] = (),
+) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
-    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial)
+    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial, priors=priors)
     _filter(mapper)
     return cost_ratio
 

@@ -4,18 +4,26 @@ Only tracks of three views or more adjust the cameras, since tracks of two views
 Points of two views are refined afterwards with the cameras fixed.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pycolmap
 import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
 from colmap_vg.geometry.directions import normalized
-from colmap_vg.mapping.observations import Observations, loss_scale
+from colmap_vg.mapping.observations import Observations, keypoint_sigma, loss_scale
 from colmap_vg.mapping.options import MIN_TRACK_LENGTH, bundle_options
 from colmap_vg.mapping.point_refinement import refine_points
 from colmap_vg.options import MappingOptions
 
 
-def adjust_bundle(reconstruction: "pycolmap.Reconstruction", options: MappingOptions, *, trial: bool = False) -> float:
+def adjust_bundle(
+    reconstruction: "pycolmap.Reconstruction",
+    options: MappingOptions,
+    *,
+    trial: bool = False,
+    priors: Sequence["pycolmap.PosePrior"] = (),
+) -> float:
     """Adjust cameras and points, in place.
 
     Parameters
@@ -24,6 +32,9 @@ def adjust_bundle(reconstruction: "pycolmap.Reconstruction", options: MappingOpt
     options : MappingOptions
     trial : bool
         Only the cost is asked for: the adjustment ends early.
+    priors : sequence of pycolmap.PosePrior, optional
+        Positions of three images or more in the frame of the reconstruction, with covariances in its unit; they fix
+        the gauge.
 
     Returns
     -------
@@ -35,12 +46,33 @@ def adjust_bundle(reconstruction: "pycolmap.Reconstruction", options: MappingOpt
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
         config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    summary = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
+    if priors:
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+            bundle,
+            pycolmap.PosePriorBundleAdjustmentOptions(),
+            config,
+            _weighted(priors, reconstruction),
+            reconstruction,
+        )
+    else:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
+    summary = adjuster.solve()
     _move_short_tracks(reconstruction, scale)
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
+
+
+def _weighted(
+    priors: Sequence["pycolmap.PosePrior"], reconstruction: "pycolmap.Reconstruction"
+) -> list["pycolmap.PosePrior"]:
+    """Priors with covariances relative to those of keypoints, which COLMAP takes to be one pixel squared."""
+    variance = keypoint_sigma(reconstruction, MIN_TRACK_LENGTH) ** 2
+    copies = [pycolmap.PosePrior(prior.todict()) for prior in priors]
+    for copy in copies:
+        copy.position_covariance = np.asarray(copy.position_covariance) / variance
+    return copies
 
 
 def _move_short_tracks(reconstruction: "pycolmap.Reconstruction", scale_px: float) -> None:

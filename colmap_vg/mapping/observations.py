@@ -94,19 +94,34 @@ def loss_scale(reconstruction: "pycolmap.Reconstruction", min_track_length: int)
     min_track_length : int
         Shorter tracks do not count.
     """
+    squared = _squared_errors(reconstruction, min_track_length)
+    if not len(squared):
+        return float(SCALES_IN_SIGMAS[0] * MIN_SIGMA_PX)
+    sigma = _sigma(squared)
+    return sigma * float(SCALES_IN_SIGMAS[np.argmin(variances(squared / sigma**2, SCALES_IN_SIGMAS))])
+
+
+def keypoint_sigma(reconstruction: "pycolmap.Reconstruction", min_track_length: int) -> float:
+    """Standard deviation of keypoints, pixels, by the median residual of a model's tracks of some length."""
+    squared = _squared_errors(reconstruction, min_track_length)
+    return _sigma(squared) if len(squared) else MIN_SIGMA_PX
+
+
+def _sigma(squared: Array) -> float:
+    return max(float(np.sqrt(np.median(squared))) / _MEDIAN_NORM, MIN_SIGMA_PX)
+
+
+def _squared_errors(reconstruction: "pycolmap.Reconstruction", min_track_length: int) -> Array:
+    """Squared residuals (k,) of a sample of points, as they would be of known points."""
     long = [p for _, p in sorted(reconstruction.points3D.items()) if p.track.length() >= min_track_length]
     if not long:
-        return float(SCALES_IN_SIGMAS[0] * MIN_SIGMA_PX)
+        return np.zeros(0)
     rows = np.linspace(0, len(long) - 1, min(len(long), NUM_SAMPLED_POINTS)).astype(np.int64)
     sample = Observations.of(reconstruction, [long[row] for row in np.unique(rows).tolist()])
     # A point takes up three of the 2 L coordinates of its track, which reduces their residuals.
     length = np.bincount(sample.point_row)[sample.point_row]
     errors = sample.reprojection_errors(reconstruction) / np.sqrt(np.maximum(1.0 - 1.5 / length, 0.25))
-    squared = np.square(errors[np.isfinite(errors)])
-    if not len(squared):
-        return float(SCALES_IN_SIGMAS[0] * MIN_SIGMA_PX)
-    sigma = max(float(np.sqrt(np.median(squared))) / _MEDIAN_NORM, MIN_SIGMA_PX)
-    return sigma * float(SCALES_IN_SIGMAS[np.argmin(variances(squared / sigma**2, SCALES_IN_SIGMAS))])
+    return np.asarray(np.square(errors[np.isfinite(errors)]))
 
 
 def variances(squared: Array, scales: Array) -> Array:

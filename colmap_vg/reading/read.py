@@ -1,5 +1,6 @@
 """Read a viewing graph from a COLMAP database: all images, and all verified pairs with a verdict each."""
 
+from dataclasses import replace
 from os import PathLike
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, has_radial_term, with_focal_scale
 from colmap_vg.colmap_io.pair_lists import listed_edges
+from colmap_vg.colmap_io.pose_priors import read_pose_priors
 from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
 from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
@@ -63,7 +65,9 @@ def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) 
     tables, changed = with_verified_geometries(tables, options.random_seed, expected)
     changed |= thinned
     focals = decide_focal_lengths(tables, options)
-    return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
+    priors, ignored = read_pose_priors(database_path, tables.image_ids.tolist())
+    graph = replace(_graph(tables, focals, changed, terms, options), priors=priors)
+    return graph, (*tables.caveats, *focals.caveats, *ignored)
 
 
 def _graph(

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from colmap_vg.jobs.summary import georeference_line
 from colmap_vg.jobs.verdict_tables import ImageRow
 from colmap_vg.report.contents import Contents
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
@@ -55,6 +56,8 @@ class Overview:
         Name, seconds, peak memory and result.
     seconds, peak_memory_mib : float
     options : tuple of (str, str)
+    georeferences : tuple of str
+        Frame and measured positions of each georeferenced model.
     comparison : tuple of (str, str)
         Errors against the true cameras; empty except for demos.
     """
@@ -77,6 +80,7 @@ class Overview:
     seconds: float
     peak_memory_mib: float
     options: tuple[tuple[str, str], ...]
+    georeferences: tuple[str, ...]
     comparison: tuple[tuple[str, str], ...]
 
 
@@ -115,6 +119,11 @@ def overview(contents: Contents) -> Overview:
         float(summary["seconds"]),
         float(summary["peak_memory_mib"]),
         tuple(_flat("", summary["options"])),
+        tuple(
+            f"Model {name}: {georeference_line(model['georeference'])}."
+            for name, model in enumerate(summary.get("models", []))
+            if model.get("georeference")
+        ),
         tuple(_flat("", summary.get("comparison", {}))),
     )
 

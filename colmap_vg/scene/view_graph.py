@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.errors import GraphError
+from colmap_vg.scene.pose_priors import PosePriors
 from colmap_vg.scene.verdicts import USED_EDGES, EdgeVerdict
 
 Array = NDArray[np.float64]
@@ -48,6 +49,8 @@ class ViewGraph:
         Row of each image's camera in the per-camera arrays.
     image_names : tuple of str
         Names in the order of `image_ids`; empty when unknown.
+    priors : PosePriors or None
+        Measured positions and gravity of the images.
     camera_ids : (c,) int64 array or None
         Camera ids of the database.
     camera_focal_lengths : (c,) array or None
@@ -87,6 +90,7 @@ class ViewGraph:
     num_inliers: IntArray | None = None
     camera_idx: IntArray | None = None
     image_names: tuple[str, ...] = field(default=(), kw_only=True)
+    priors: PosePriors | None = field(default=None, kw_only=True)
     camera_ids: IntArray | None = field(default=None, kw_only=True)
     camera_focal_lengths: Array | None = field(default=None, kw_only=True)
     camera_focal_known: BoolArray | None = field(default=None, kw_only=True)
@@ -185,6 +189,8 @@ class ViewGraph:
                 )
         if self.image_names and len(self.image_names) != n:
             raise GraphError(f"ViewGraph.image_names has {len(self.image_names)} names for {n} images")
+        if self.priors is not None and len(self.priors.positions) != n:
+            raise GraphError(f"ViewGraph.priors are of {len(self.priors.positions)} images, expected {n}")
 
     def _check_values(self) -> None:
         n, edges, R, g = self.num_images, self.edges, self.cam2_from_cam1_rotations, self.cam2_in_cam1_directions

@@ -51,9 +51,9 @@ def test_the_scale_of_the_residuals_and_the_trial_reach_the_adjustment(
 def test_one_more_round_is_a_trial_where_that_is_asked_for(trial: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def adjusted(*arguments: object, trial: bool) -> float:
+    def adjusted(*arguments: object, trial: bool, **options: object) -> float:
         asked.append(trial)
-        return adjust_bundle(*arguments, trial=trial)
+        return adjust_bundle(*arguments, trial=trial, **options)
 
     monkeypatch.setattr(build, "adjust_bundle", adjusted)
     pycolmap.set_random_seed(0)

@@ -1,0 +1,156 @@
+"""Georeferenced jobs: as exact as the measured positions allow, wrong ones named, and nothing claimed without them."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from measured_positions import by_gps, east_north_up, prior, write_priors
+from synthetic_databases import make_database
+from typer.testing import CliRunner
+
+from colmap_vg import MappingOptions
+from colmap_vg.cli.main import app
+from colmap_vg.events import StageLog
+from colmap_vg.jobs.mapper import MappingResult, map_database
+from colmap_vg.simulation.database import write_synthetic_database
+from colmap_vg.simulation.views import SyntheticViews, synthetic_views
+
+NUM_IMAGES, METRES = 40, 10.0
+
+
+@pytest.fixture(scope="module")
+def flight() -> SyntheticViews:
+    return synthetic_views("drone", NUM_IMAGES, noise_px=0.5)
+
+
+@pytest.fixture(scope="module")
+def plain(flight: SyntheticViews, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("flight") / "database.db"
+    write_synthetic_database(path, flight)
+    return path
+
+
+def mapped(path: Path, output: Path, **options: bool) -> tuple[MappingResult, list[str]]:
+    log = StageLog()
+    return map_database(path, None, output, MappingOptions(num_threads=1, **options), log), log.warnings
+
+
+def errors_in_frame(result: MappingResult, truth: np.ndarray) -> np.ndarray:
+    """Distances (n,) of a georeferenced model's cameras from true positions east, north and up of `ORIGIN`."""
+    told = result.georeferences[0]
+    assert told is not None
+    assert told.origin is not None
+    expected = np.array([east_north_up(*place, told.origin) for place in by_gps(truth)])
+    images = [image for image in result.models[0].images.values() if image.has_pose]
+    return np.array([np.linalg.norm(im.projection_center() - expected[int(im.name[:5])]) for im in images])
+
+
+def test_a_flight_with_wrong_positions(plain: Path, flight: SyntheticViews, tmp_path: Path) -> None:
+    path = Path(shutil.copyfile(plain, tmp_path / "database.db"))
+    rng, sigma = np.random.default_rng(1), 3.0
+    truth = METRES * flight.projection_centers
+    measured = truth + sigma * rng.normal(size=truth.shape)
+    wrong = np.sort(rng.permutation(NUM_IMAGES)[:4])
+    measured[wrong] += 1000.0 * np.array([0.6, 0.8, 0.0])
+    write_priors(path, [prior(row + 1, place, "WGS84") for row, place in enumerate(by_gps(measured))])
+    result, warnings = mapped(path, tmp_path / "out")
+    told = result.georeferences[0]
+    assert told is not None
+    assert told.frame == "ENU"
+    assert told.outliers == tuple(f"{row:05d}.jpg" for row in wrong)
+    assert len(told.residuals) == NUM_IMAGES
+    assert warnings[0].startswith("4 of 40 measured positions are wrong and not used (first: ")
+    errors = errors_in_frame(result, truth)
+    assert len(errors) == NUM_IMAGES
+    # Seven unknowns from 36 positions: root mean square error sigma sqrt(7 / 36).
+    assert np.sqrt(np.mean(errors**2)) < 1.5 * sigma * np.sqrt(7 / 36)
+    np.testing.assert_allclose(told.sigmas, sigma, rtol=0.35)
+    name = "00002.jpg"
+    image = next(image for image in result.models[0].images.values() if image.name == name)
+    expected = east_north_up(*by_gps(measured[2:3])[0], told.origin or (0.0, 0.0, 0.0)) - image.projection_center()
+    np.testing.assert_allclose(told.residuals[name], expected, atol=1e-4)
+
+
+def test_precise_positions_straighten_a_model(plain: Path, flight: SyntheticViews, tmp_path: Path) -> None:
+    path = Path(shutil.copyfile(plain, tmp_path / "database.db"))
+    truth = METRES * flight.projection_centers
+    write_priors(path, [prior(row + 1, place, "WGS84", 1e-3) for row, place in enumerate(by_gps(truth))])
+    result, warnings = mapped(path, tmp_path / "out")
+    assert warnings == []
+    with_priors = np.sqrt(np.mean(errors_in_frame(result, truth) ** 2))
+    path = Path(shutil.copyfile(plain, tmp_path / "again.db"))
+    write_priors(path, [prior(row + 1, place, "WGS84", 30.0) for row, place in enumerate(by_gps(truth))])
+    aligned, _ = mapped(path, tmp_path / "out2")
+    assert with_priors < 0.3 * np.sqrt(np.mean(errors_in_frame(aligned, truth) ** 2))
+
+
+def test_a_straight_flight_is_level(tmp_path: Path) -> None:
+    street = synthetic_views("street", 30, noise_px=0.3)
+    write_synthetic_database(tmp_path / "database.db", street)
+    truth = METRES * street.projection_centers
+    measured = truth + 3.0 * np.random.default_rng(0).normal(size=truth.shape)
+    write_priors(tmp_path / "database.db", [prior(k + 1, x, "WGS84") for k, x in enumerate(by_gps(measured))])
+    result, warnings = mapped(tmp_path / "database.db", tmp_path / "out")
+    told = result.georeferences[0]
+    assert told is not None
+    assert told.level_is_guessed
+    assert warnings[-1].startswith("The cameras lie nearly on a line")
+    # Image rows are horizontal along this street, so the guess is right to within the noise of the cameras' roll.
+    rows = [im.cam_from_world().rotation.matrix()[0, 2] for im in result.models[0].images.values() if im.has_pose]
+    assert abs(np.mean(rows)) < 0.05
+    down = [im.cam_from_world().rotation.matrix()[1, 2] for im in result.models[0].images.values() if im.has_pose]
+    assert np.mean(down) < -0.9
+    assert np.sqrt(np.mean(errors_in_frame(result, truth) ** 2)) < 3.0 * np.sqrt(7 / 30) * 1.5
+
+
+@pytest.mark.parametrize("system", ["CARTESIAN", "WGS84"])
+def test_colmaps_own_pipeline_test_with_positions(tmp_path: Path, system: str) -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=200, prior_position=True)
+    options.prior_position_coordinate_system = getattr(pycolmap.PosePriorCoordinateSystem, system)
+    pycolmap.set_random_seed(0)
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        noise = pycolmap.SyntheticNoiseOptions(prior_position_stddev=0.05, point2D_stddev=0.5)
+        pycolmap.synthesize_noise(noise, truth, database)
+    result, _ = mapped(tmp_path / "database.db", tmp_path / "out")
+    model = result.models[0]
+    assert model.num_reg_images() == 12
+    errors = np.array([model.image(i).projection_center() - truth.image(i).projection_center() for i in truth.images])
+    if system == "WGS84":  # our origin is another point
+        errors -= errors.mean(axis=0)
+    assert np.linalg.norm(errors, axis=1).mean() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [("random", "agree with it|too uncertain"), ("two", "Only 2 images of a model have a measured position")],
+)
+def test_positions_that_say_nothing_are_not_used(tmp_path: Path, kind: str, told: str) -> None:
+    make_database(tmp_path / "database.db", num_images=10, num_points=100, noise_px=0.3)
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(10, 3)) if kind == "random" else np.zeros((2, 3))
+    write_priors(tmp_path / "database.db", [prior(row + 1, place) for row, place in enumerate(places)])
+    result, warnings = mapped(tmp_path / "database.db", tmp_path / "out")
+    assert result.georeferences == (None,)
+    assert any(re.search(told, warning) for warning in warnings)
+
+
+def test_it_can_be_switched_off_and_is_told(plain: Path, flight: SyntheticViews, tmp_path: Path) -> None:
+    path = Path(shutil.copyfile(plain, tmp_path / "database.db"))
+    places = by_gps(METRES * flight.projection_centers)
+    write_priors(path, [prior(row + 1, place, "WGS84", 0.5) for row, place in enumerate(places)])
+    job = ["mapper", "--database_path", str(path), "--output_path"]
+    told = CliRunner().invoke(app, [*job, str(tmp_path / "on")])
+    assert told.exit_code == 0, told.output
+    assert "metres east, north and up of 47.30" in told.output
+    model = json.loads((tmp_path / "on" / "summary.json").read_text())["models"][0]
+    assert model["georeference"]["frame"] == "ENU"
+    assert "metres east, north and up of" in (tmp_path / "on" / "report.html").read_text(encoding="utf-8")
+    off = CliRunner().invoke(app, [*job, str(tmp_path / "off"), "--Mapper.use_prior_position", "0"])
+    assert off.exit_code == 0, off.output
+    assert "metres east" not in off.output
+    assert json.loads((tmp_path / "off" / "summary.json").read_text())["models"][0]["georeference"] is None
