@@ -14,6 +14,7 @@ RotationAveraging = Literal["robust", "chordal"]
 Quality = Literal["low", "medium", "high", "extreme"]
 CameraMode = Literal["auto", "single", "per_folder", "per_image"]
 Extractor = Literal["opencv", "colmap"]
+RigLayout = Literal["none", "folders"]
 Matching = Literal["auto", "exhaustive", "selected", "sequential", "spatial"]
 
 
@@ -108,6 +109,8 @@ class FeatureOptions(_Checked):
     matching: Matching = "auto"  # auto: exhaustive for up to 20 images, else selected (by the largest features)
     image_list_path: str | PathLike[str] | None = None  # file with one image name per line; None: all in the folder
     mask_path: str | PathLike[str] | None = None  # folder of masks: NAME.png or NAME.jpg of image NAME; black is masked
+    rigs: RigLayout = "none"  # folders: one rig, a folder for each camera, and photographs of one name are a frame
+    rig_config_path: str | PathLike[str] | None = None  # COLMAP's rig configuration file (JSON)
     max_image_size: int = _number(-1, -1)  # pixels, longer side; larger images are resized; -1: 3200
     max_num_features: int = _number(8192, 1)  # per image
     sequential_overlap: int = _number(10, 1)  # images; each is matched with this many that follow it

@@ -24,6 +24,7 @@ from colmap_vg.options import (
     OutlierFilter,
     Quality,
     ReadOptions,
+    RigLayout,
     RotationAveraging,
     SolveOptions,
 )
@@ -131,6 +132,16 @@ class FeatureFlags:
             "--mask_path",
             help="Folder of masks, NAME.png or NAME.jpg for image NAME. No features are taken where a mask is black.",
         ),
+    ] = None
+    rigs: Annotated[
+        RigLayout,
+        typer.Option(
+            "--rigs",
+            help="folders: one rig, with a folder for each camera; photographs taken at once have the same name.",
+        ),
+    ] = FeatureOptions.rigs
+    rig_config_path: Annotated[
+        Path | None, typer.Option("--rig_config_path", help="COLMAP's rig configuration file, rig_config.json.")
     ] = None
     max_image_size: Annotated[
         int | None,

@@ -130,7 +130,8 @@ def _solve(
     asked: Mapping[str, object],
 ) -> None:
     from colmap_vg.colmap_io.database import check_database
-    from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
+    from colmap_vg.colmap_io.reconstruction import loaded_cache, write_model
+    from colmap_vg.mapping.posed_model import posed_model
     from colmap_vg.reading.read import read_with_caveats
     from colmap_vg.solver.solve import solve_view_graph
 
@@ -153,7 +154,7 @@ def _solve(
         staged = stage_models(work, int(solution.component.max(initial=-1)) + 1)
         with loaded_cache(database_path, work, read.min_num_inliers, graph=graph) as (cache, _):
             for component, folder in enumerate(staged):
-                write_model(reconstruction_from_solution(cache, solution, graph, component), folder)
+                write_model(posed_model(cache, solution, graph, component), folder)
         log.result(", ".join(map(str, publish_models(staged, output_path))))
     content = job_summary("solve", asked, reporter.records, reporter.warnings)
     content |= _verdicts(graph, solution, output_path, {})

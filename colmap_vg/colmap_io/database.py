@@ -66,7 +66,7 @@ def check_database(database_path: str | PathLike[str]) -> None:
     Raises
     ------
     DatabaseError
-        As for :func:`reading`; also when there are no images, no verified pairs, or a rig of several cameras.
+        As for :func:`reading`; also when there are no images or no verified pairs.
     """
     with reading(database_path) as connection:
         (num_images,) = connection.execute("SELECT COUNT(*) FROM images").fetchone()
@@ -78,7 +78,6 @@ def check_database(database_path: str | PathLike[str]) -> None:
                 f"{database_path}: contains {num_images} images but no verified pairs; match them first"
                 " (colmap exhaustive_matcher), or verify the matches (colmap geometric_verifier)"
             )
-        _refuse_rigs(connection, Path(database_path))
 
 
 def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:
@@ -172,16 +171,3 @@ def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
     missing = [name for name in REQUIRED_TABLES if name not in found]
     if missing:
         raise DatabaseError(f"{path}: is not a COLMAP database, it has no table {', '.join(missing)}")
-
-
-def _refuse_rigs(connection: sqlite3.Connection, path: Path) -> None:
-    """Raise an error for rigs of several sensors: they are not supported, since setting one pose moves the others."""
-    tables = connection.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'rig_sensors'").fetchone()
-    if tables[0] == 0:  # an older schema
-        return
-    rig = connection.execute("SELECT rig_id, COUNT(*) + 1 FROM rig_sensors GROUP BY rig_id ORDER BY rig_id").fetchone()
-    if rig is not None:
-        raise DatabaseError(
-            f"{path}: rig {rig[0]} has {rig[1]} sensors; rigs are not supported yet: map the images with"
-            " pycolmap.global_mapping, or create the database without a rig"
-        )

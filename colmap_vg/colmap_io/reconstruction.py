@@ -12,8 +12,10 @@ import pycolmap
 from colmap_vg.colmap_io.cameras import with_focal_scale, with_radial_term
 from colmap_vg.colmap_io.database import working_copy
 from colmap_vg.colmap_io.loading import loaded_reconstruction
+from colmap_vg.colmap_io.rigs import store_separated
 from colmap_vg.colmap_io.shared_cameras import merge_cameras
 from colmap_vg.errors import DatabaseError, OutputError
+from colmap_vg.scene.rigs import RigPoses, Rigs
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.scene.view_graph import ViewGraph
 
@@ -41,8 +43,8 @@ def loaded_cache(
     without_pairs : sequence of (int, int)
         Image ids of pairs that are not loaded.
     graph : ViewGraph, optional
-        As read from the database: the matches of pairs that were verified again replace the database's, and its
-        cameras get the radial terms that were found.
+        As read from the database: the matches of pairs that were verified again replace the database's, its cameras
+        get the radial terms that were found, and its rigs those of the graph.
 
     Yields
     ------
@@ -62,6 +64,8 @@ def loaded_cache(
             if graph is not None:
                 _replace_matches(copy, graph)
                 _add_radial_terms(copy, graph)
+                if graph.rigs is not None:
+                    store_separated(copy, graph.image_ids, graph.rigs)
             if without_pairs:
                 _delete_pairs(copy, without_pairs)
             if shared:
@@ -112,7 +116,11 @@ def _delete_pairs(copy: Path, pairs: Sequence[tuple[int, int]]) -> None:
 
 
 def reconstruction_from_solution(
-    cache: "pycolmap.DatabaseCache", solution: PoseSolution, graph: ViewGraph, component: int = 0
+    cache: "pycolmap.DatabaseCache",
+    solution: PoseSolution,
+    graph: ViewGraph,
+    component: int = 0,
+    rig_poses: RigPoses | None = None,
 ) -> "pycolmap.Reconstruction":
     """Make a reconstruction with the poses of one component, without points.
 
@@ -124,6 +132,8 @@ def reconstruction_from_solution(
         Its focal factors multiply the graph's focal lengths.
     graph : ViewGraph
     component : int
+    rig_poses : RigPoses, optional
+        Poses of the component's frames and sensors, for a graph with rigs; the model gets the unit of known rigs.
 
     Returns
     -------
@@ -144,6 +154,9 @@ def reconstruction_from_solution(
                     camera.params = with_focal_scale(camera, factor).params.tolist()
                 if term != 0.0:
                     camera.params = with_radial_term(camera, term).params.tolist()
+    if graph.rigs is not None and rig_poses is not None:
+        _register_frames(reconstruction, graph.rigs, rig_poses)
+        return reconstruction
     for row in np.flatnonzero(solution.component == component):
         R, center = solution.cam_from_world_rotations[row], solution.projection_centers[row]
         image = reconstruction.image(int(solution.image_ids[row]))
@@ -152,6 +165,24 @@ def reconstruction_from_solution(
         frame.set_cam_from_world(image.camera_id, pose)
         reconstruction.register_frame(image.frame_id)
     return reconstruction
+
+
+def _register_frames(reconstruction: "pycolmap.Reconstruction", rigs: Rigs, found: RigPoses) -> None:
+    """Register frames with averaged poses, and set those of sensors that the database does not know."""
+    for row in np.flatnonzero(found.posed_sensors & ~rigs.known).tolist():
+        R = found.sensor_rotations[row]
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ found.sensor_centers[row] * found.scale)
+        sensor = reconstruction.camera(int(rigs.camera_ids[row])).sensor_id
+        reconstruction.rig(int(rigs.rig_ids[row])).set_sensor_from_rig(sensor, pose)
+    # A frame with an image whose sensor has no place cannot be registered.
+    lost = np.bincount(
+        rigs.frame_idx, weights=~(found.posed_sensors | rigs.known)[rigs.sensor_idx], minlength=rigs.num_frames
+    )
+    for row in np.flatnonzero(found.posed_frames & (lost == 0)).tolist():
+        R = found.frame_rotations[row]
+        frame = reconstruction.frame(int(rigs.frame_ids[row]))
+        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ found.frame_centers[row] * found.scale)
+        reconstruction.register_frame(frame.frame_id)
 
 
 def write_model(reconstruction: "pycolmap.Reconstruction", folder: Path) -> None:

@@ -25,6 +25,7 @@ from colmap_vg.features.photographs import (
     find_photographs,
     split_odd_sizes,
 )
+from colmap_vg.features.rigs import configure_rigs, wants_rigs, with_rig_cameras
 from colmap_vg.features.sift_extraction import extract_sift
 from colmap_vg.features.staging import readable_folder
 from colmap_vg.linear.threads import num_workers
@@ -87,12 +88,14 @@ def extract_and_match(
     OptionError
         The camera model is unknown, or does not take so many parameters.
     """
-    options, log = FeatureOptions.given(options), log or StageLog()
+    options, log = with_rig_cameras(FeatureOptions.given(options)), log or StageLog()
     photographs, skipped = check_photographs(image_path, options, log)
     names = [photograph.name for photograph in photographs]
     copies = Path(f"{os.fspath(database_path)}-copies")
     with readable_folder(image_path, photographs, options, copies) as (folder, reading):
         names, unreadable = extract_features(folder, database_path, names, reading, log)
+    if wants_rigs(options):
+        configure_rigs(database_path, options)
     num_pairs = match_features(database_path, options, log)
     return FeatureResult(tuple(names), (*skipped, *unreadable), num_pairs)
 

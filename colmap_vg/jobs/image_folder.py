@@ -17,6 +17,7 @@ from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.features.extraction import UNREADABLE, FeatureResult, check_photographs
 from colmap_vg.features.isolated import extract_features_apart, match_features_apart
 from colmap_vg.features.photographs import SkippedFile
+from colmap_vg.features.rigs import configure_rigs, wants_rigs, with_rig_cameras
 from colmap_vg.features.staging import readable_folder
 from colmap_vg.jobs.atomic_write import atomic_write
 from colmap_vg.jobs.mapper import view_graph_mapping
@@ -102,7 +103,7 @@ def make_database(
     OutputError
         The output cannot be written, or holds models or a database that this function did not make.
     """
-    options, log = FeatureOptions.given(options), log or StageLog()
+    options, log = with_rig_cameras(FeatureOptions.given(options)), log or StageLog()
     refuse_models(output_path, overwrite)
     finished, record_path = Path(output_path) / DATABASE_NAME, Path(output_path) / WORK_NAME / RECORD_NAME
     if finished.exists() and not record_path.exists() and not overwrite:
@@ -132,12 +133,19 @@ def make_database(
             _remove_previous(finished, unfinished, record_path, record)
         with readable_folder(image_path, photographs, options, work / COPIES_NAME) as (folder, reading):
             names, unreadable = extract_features_apart(folder, unfinished, names, reading, log, lock_descriptors())
+        _configure_rigs(unfinished, options, log)
         num_verified_pairs = match_features_apart(unfinished, options, log, lock_descriptors())
         try:
             unfinished.replace(finished)
         except OSError as error:
             raise OutputError(f"cannot write {finished}: {error.strerror}; choose another output_path") from error
         return FeatureResult(tuple(names), (*skipped, *unreadable), num_verified_pairs)
+
+
+def _configure_rigs(database_path: Path, options: FeatureOptions, log: StageLog) -> None:
+    if wants_rigs(options):
+        with log.stage("rigs"):
+            log.result(configure_rigs(database_path, options))
 
 
 def _remove_previous(finished: Path, unfinished: Path, record_path: Path, record: dict[str, object]) -> None:
@@ -162,6 +170,9 @@ def _record(image_path: str | PathLike[str], names: list[str], options: FeatureO
     files = [(name, (folder / name).stat()) for name in names]
     kept = {key: value for key, value in asdict(options).items() if key not in ("num_threads", "image_list_path")}
     kept["mask_path"] = None if options.mask_path is None else str(Path(options.mask_path).resolve())
+    kept["rig_config_path"] = (
+        None if options.rig_config_path is None else Path(options.rig_config_path).read_text("utf-8")
+    )
     record = {
         "image_path": str(folder.resolve()),
         "files": [[name, status.st_size, status.st_mtime_ns] for name, status in files],

@@ -13,7 +13,7 @@ from colmap_vg.colmap_io.database import check_database
 from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.quiet import quiet_colmap
 from colmap_vg.colmap_io.raw_matches import compared_pairs
-from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution, write_model
+from colmap_vg.colmap_io.reconstruction import loaded_cache, write_model
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cameras
 from colmap_vg.errors import MappingError
 from colmap_vg.events import StageEvent, StageLog
@@ -30,6 +30,7 @@ from colmap_vg.mapping.colors import extract_colors
 from colmap_vg.mapping.georeference import Georeference, georeference
 from colmap_vg.mapping.join import Joint, joined_poses, joint_of
 from colmap_vg.mapping.pair_agreement import PairRotations
+from colmap_vg.mapping.posed_model import posed_model, scale_is_uncertain, with_placed_sensors
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
 from colmap_vg.mapping.weak_cuts import WeakCut, cut_along, weak_cuts
 from colmap_vg.options import MappingOptions, SolveOptions
@@ -161,7 +162,8 @@ def map_database(
             staged = stage_models(work, len(built))
             for folder, model in zip(staged, built, strict=True):
                 if model.georeference is None:
-                    model.reconstruction.normalize()
+                    metric = graph.rigs is not None and graph.rigs.is_metric
+                    model.reconstruction.normalize(fixed_scale=metric)
                 if options.extract_colors:
                     extract_colors(model.reconstruction, image_path, log)
                 write_model(model.reconstruction, folder)
@@ -193,7 +195,18 @@ def _build(
 ) -> list[_Model]:
     """Build models of all components with enough points, and sort them by number of images, the largest first."""
     refined = options.ba_refine_focal_length or options.ba_refine_principal_point or options.ba_refine_extra_params
-    shared = shared_cameras(graph) if options.share_cameras and refined else []
+    shared = shared_cameras(graph) if options.share_cameras and refined and graph.rigs is None else []
+    graph, num_separated = with_placed_sensors(graph, solution)
+    if num_separated:
+        log.warn(
+            f"The places of {num_separated} cameras in their rig are not known, and no frame tells them: their images"
+            " are placed one by one."
+        )
+    if scale_is_uncertain(graph, solution):
+        log.warn(
+            "The known distances between the cameras of the rig do not tell the model's scale: it is arbitrary, and"
+            " cameras that see no points of their own may be off by as much."
+        )
     without = _false_pairs(graph, solution)
     with log.stage("load"):
         with loaded_cache(database_path, work, options.read.min_num_inliers, shared, without, graph) as (
@@ -201,7 +214,7 @@ def _build(
             replaced,
         ):
             components = range(int(solution.component.max(initial=-1)) + 1)
-            posed = [reconstruction_from_solution(cache, solution, graph, component) for component in components]
+            posed = [posed_model(cache, solution, graph, component) for component in components]
         if replaced:
             log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
     models: list[_Model] = []
@@ -364,7 +377,7 @@ def _point_evidence(
         cache,
         _,
     ):
-        return point_evidence(cache, reconstruction_from_solution(cache, solution, graph, 0), options)
+        return point_evidence(cache, posed_model(cache, solution, graph), options)
 
 
 def _false_pairs(graph: ViewGraph, solution: PoseSolution) -> list[tuple[int, int]]:

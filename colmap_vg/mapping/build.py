@@ -4,6 +4,7 @@ pycolmap does the heavy work. The given poses are nearly right, so one short rou
 a mapper that starts from rough poses needs many.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.events import StageLog
-from colmap_vg.mapping.bundle import adjust_bundle
+from colmap_vg.mapping.bundle import adjust_bundle, placed_sensors
 from colmap_vg.mapping.lenses import reset_diverged_lenses
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
@@ -88,7 +89,7 @@ def build_model(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    triangulator = triangulator_options(options)
+    triangulator, fixed = triangulator_options(options), placed_sensors(cache)
     with log.stage("triangulate"):
         image_ids = sorted(reconstruction.reg_image_ids())
         for count, image_id in enumerate(image_ids, start=1):
@@ -97,17 +98,17 @@ def build_model(
         mapper.complete_and_merge_tracks(triangulator)
         log.result(f"{reconstruction.num_points3D()} points")
     with log.stage("adjust"):
-        if not _adjust_to_convergence(mapper, options):
+        if not _adjust_to_convergence(mapper, options, fixed):
             log.warn(f"Bundle adjustment did not converge in {MAX_NUM_ROUNDS} rounds; the model may be bent.")
         log.result(_state(reconstruction))
     with log.stage("register"):
-        misplaced = _register_remaining(mapper, options, others, pairs, log)
+        misplaced = _register_remaining(mapper, options, fixed, others, pairs, log)
         reset_diverged_lenses(
             reconstruction,
             cache,
             options,
             log,
-            lambda changed: _adjust(mapper, changed),
+            lambda changed: _adjust(mapper, changed, fixed),
         )
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
@@ -115,11 +116,13 @@ def build_model(
     return BuildResult(frozenset(misplaced), folded)
 
 
-def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: MappingOptions) -> bool:
+def _adjust_to_convergence(
+    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, fixed: Sequence["pycolmap.sensor_t"]
+) -> bool:
     """Alternate bundle adjustment and retriangulation; return whether they converged in `MAX_NUM_ROUNDS` rounds."""
     triangulator = triangulator_options(options)
     lenses = _focal_lengths(mapper.reconstruction)
-    cost_ratio, enough = _adjust(mapper, options), GOOD_START_COST_RATIO
+    cost_ratio, enough = _adjust(mapper, options, fixed), GOOD_START_COST_RATIO
     for _ in range(MAX_NUM_ROUNDS):
         before, lenses = lenses, _focal_lengths(mapper.reconstruction)
         mapper.complete_and_merge_tracks(triangulator)
@@ -127,7 +130,7 @@ def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: Mappin
         _filter(mapper)
         if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
             return True
-        cost_ratio = _adjust(mapper, options)
+        cost_ratio = _adjust(mapper, options, fixed)
         enough = CONVERGED_COST_RATIO
     return False
 
@@ -135,6 +138,7 @@ def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: Mappin
 def _register_remaining(
     mapper: "pycolmap.IncrementalMapper",
     options: MappingOptions,
+    fixed: Sequence["pycolmap.sensor_t"],
     others: frozenset[int],
     pairs: PairRotations | None,
     log: StageLog,
@@ -148,7 +152,7 @@ def _register_remaining(
     added -= misplaced
     if added or removed or misplaced:
         mapper.complete_and_merge_tracks(triangulator_options(options))
-        _adjust(mapper, options)
+        _adjust(mapper, options, fixed)
         again = _remove_unsupported(mapper)
         removed, added = removed | again, added - again
     log.result(f"{len(added)} images added, {len(removed)} removed")
@@ -188,7 +192,7 @@ def adjust_once_more(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    share = _adjust(mapper, options, trial=trial, priors=priors)
+    share = _adjust(mapper, options, placed_sensors(cache), trial=trial, priors=priors)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return share
@@ -197,12 +201,13 @@ def adjust_once_more(
 def _adjust(
     mapper: "pycolmap.IncrementalMapper",
     options: MappingOptions,
+    fixed: Sequence["pycolmap.sensor_t"],
     *,
     trial: bool = False,
     priors: Sequence["pycolmap.PosePrior"] = (),
 ) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
-    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial, priors=priors)
+    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial, priors=priors, fixed_sensors=fixed)
     _filter(mapper)
     return cost_ratio
 
@@ -213,17 +218,19 @@ def _filter(mapper: "pycolmap.IncrementalMapper") -> None:
 
 
 def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
-    """Deregister images with too few observations of well-triangulated points, weakest first; return their ids."""
+    """Deregister frames with too few observations of well-triangulated points, weakest first; return their images."""
     reconstruction = mapper.reconstruction
     removed: set[int] = set()
     while True:
-        support = supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG)
-        weak = [(count, image_id) for image_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]
+        support: Counter[int] = Counter()
+        for image_id, count in supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG).items():
+            support[reconstruction.image(image_id).frame_id] += count
+        weak = [(count, frame_id) for frame_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]
         if not weak:
             return removed
-        _, image_id = min(weak)
-        mapper.observation_manager.deregister_frame(reconstruction.image(image_id).frame_id)
-        removed.add(image_id)
+        _, frame_id = min(weak)
+        removed |= _images_of(reconstruction, frame_id)
+        mapper.observation_manager.deregister_frame(frame_id)
 
 
 def _register_left_out(
@@ -236,8 +243,10 @@ def _register_left_out(
         candidates = [i for i in mapper.find_next_images(registration, False) if i not in never]
         for image_id in candidates:
             if mapper.register_next_image(registration, image_id):
-                mapper.triangulate_image(triangulator, image_id)
-                added.add(image_id)
+                together = _images_of(mapper.reconstruction, mapper.reconstruction.image(image_id).frame_id)
+                for each in sorted(together):
+                    mapper.triangulate_image(triangulator, each)
+                added |= together
                 break
         else:
             return added
@@ -247,10 +256,18 @@ def _remove_misplaced(mapper: "pycolmap.IncrementalMapper", added: set[int], pai
     """Deregister images added by PnP whose pairs contradict their rotation; return their ids."""
     if pairs is None or not added:
         return set()
-    misplaced = added & pair_agreement(mapper.reconstruction, pairs).contradicted
-    for image_id in sorted(misplaced):
-        mapper.observation_manager.deregister_frame(mapper.reconstruction.image(image_id).frame_id)
+    contradicted, misplaced = added & pair_agreement(mapper.reconstruction, pairs).contradicted, set()
+    for frame_id in sorted({mapper.reconstruction.image(image_id).frame_id for image_id in contradicted}):
+        together = _images_of(mapper.reconstruction, frame_id)
+        if 2 * len(together & contradicted) > len(together):
+            mapper.observation_manager.deregister_frame(frame_id)
+            misplaced |= together
     return misplaced
+
+
+def _images_of(reconstruction: "pycolmap.Reconstruction", frame_id: int) -> set[int]:
+    """Ids of the images that a frame's pose places."""
+    return {data.id for data in reconstruction.frame(frame_id).image_ids}
 
 
 def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotations | None, log: StageLog) -> bool:

@@ -17,12 +17,19 @@ from colmap_vg.mapping.point_refinement import refine_points
 from colmap_vg.options import MappingOptions
 
 
+def placed_sensors(cache: "pycolmap.DatabaseCache") -> list["pycolmap.sensor_t"]:
+    """Sensors whose place in their rig is known, so that bundle adjustment leaves it."""
+    rigs = [rig for _, rig in sorted(cache.rigs.items())]
+    return [sensor for rig in rigs for sensor in rig.non_ref_sensors if rig.has_sensor_from_rig(sensor)]
+
+
 def adjust_bundle(
     reconstruction: "pycolmap.Reconstruction",
     options: MappingOptions,
     *,
     trial: bool = False,
     priors: Sequence["pycolmap.PosePrior"] = (),
+    fixed_sensors: Sequence["pycolmap.sensor_t"] = (),
 ) -> float:
     """Adjust cameras and points, in place.
 
@@ -35,6 +42,8 @@ def adjust_bundle(
     priors : sequence of pycolmap.PosePrior, optional
         Positions of three images or more in the frame of the reconstruction, with covariances in its unit; they fix
         the gauge.
+    fixed_sensors : sequence of pycolmap.sensor_t, optional
+        Sensors whose place in their rig is not adjusted; distances between them fix the scale.
 
     Returns
     -------
@@ -46,14 +55,14 @@ def adjust_bundle(
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
         config.add_image(image_id)
+    for sensor in fixed_sensors:
+        config.set_constant_sensor_from_rig_pose(sensor)
     if priors:
-        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            bundle,
-            pycolmap.PosePriorBundleAdjustmentOptions(),
-            config,
-            _weighted(priors, reconstruction),
-            reconstruction,
-        )
+        told, weighted = pycolmap.PosePriorBundleAdjustmentOptions(), _weighted(priors, reconstruction)
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(bundle, told, config, weighted, reconstruction)
+    elif is_metric(reconstruction, fixed_sensors):
+        config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
+        adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
     else:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
@@ -62,6 +71,17 @@ def adjust_bundle(
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
+
+
+def is_metric(reconstruction: "pycolmap.Reconstruction", fixed_sensors: Sequence["pycolmap.sensor_t"]) -> bool:
+    """Whether sensors at fixed distances from their rig's origin determine the scale of a model."""
+    distances = [
+        float(np.linalg.norm(rig.sensor_from_rig(sensor).translation))
+        for _, rig in sorted(reconstruction.rigs.items())
+        for sensor in fixed_sensors
+        if rig.has_sensor(sensor)
+    ]
+    return max(distances, default=0.0) > 0.0
 
 
 def _weighted(

@@ -103,19 +103,28 @@ def joined_poses(
     for model in (other, own):
         for camera_id in sorted({model.image(i).camera_id for i in model.reg_image_ids()}):
             empty.camera(camera_id).params = model.camera(camera_id).params.tolist()
-    for model, moved in ((own, None), (other, similarity)):
-        for image_id in sorted(model.reg_image_ids()):
-            image = empty.image(image_id)
-            R, center = (
-                model.image(image_id).cam_from_world().rotation.matrix(),
-                model.image(image_id).projection_center(),
-            )
-            if moved is not None:
-                R, center = R @ moved.rotation.T, moved.apply(center[None])[0]
-            frame = empty.frame(image.frame_id)
-            frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center))
-            empty.register_frame(image.frame_id)
+    for model, moved in ((own, Similarity(1.0, np.eye(3), np.zeros(3))), (other, similarity)):
+        _place_sensors(empty, model, moved.scale)
+        for frame_id in sorted(model.reg_frame_ids()):
+            pose = model.frame(frame_id).rig_from_world
+            if pose is None:
+                continue
+            R = pose.rotation.matrix()
+            center = moved.apply(-(R.T @ pose.translation)[None])[0]
+            R = R @ moved.rotation.T
+            empty.frame(frame_id).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center)
+            empty.register_frame(frame_id)
     return empty
+
+
+def _place_sensors(empty: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", scale: float) -> None:
+    """Give sensors without a place in their rig that of a model."""
+    for rig_id, rig in sorted(model.rigs.items()):
+        for sensor in rig.non_ref_sensors:
+            pose = rig.sensor_from_rig(sensor) if rig.has_sensor_from_rig(sensor) else None
+            if pose is not None and not empty.rig(rig_id).has_sensor_from_rig(sensor):
+                scaled = pycolmap.Rigid3d(pose.rotation, scale * np.asarray(pose.translation))
+                empty.rig(rig_id).set_sensor_from_rig(sensor, scaled)
 
 
 def is_spread(points: Array) -> bool:

@@ -74,15 +74,29 @@ def pair_agreement(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
     )
     number = np.bincount(edges[~agree].ravel(), minlength=len(ids))
     contradicted = frozenset(ids[(good < 0.5 * whole) & (number >= MIN_CONTRADICTING)].tolist())
-    return PairAgreement(contradicted, _detached(ids, edges[agree], np.unique(edges)))
+    linked = np.concatenate([edges[agree], _frame_edges(reconstruction, ids)])
+    return PairAgreement(contradicted, _detached(ids, linked, np.unique(edges)))
 
 
 def agreeing_pairs(
     reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, pairs: PairRotations
 ) -> tuple[IntArray, Array]:
-    """Pairs (m, 2) of rows of the ascending `image_ids` that agree with a model, and their numbers of matches (m,)."""
+    """Pairs (m, 2) of rows of the ascending `image_ids` that agree with a model, and their numbers of matches (m,).
+
+    Images of one frame of a rig count as a pair with as many matches as the strongest.
+    """
     edges, matches, agree = _compared(reconstruction, image_ids, pairs)
-    return edges[agree], matches[agree]
+    together = _frame_edges(reconstruction, image_ids)
+    firm = np.full(len(together), matches[agree].max(initial=1.0))
+    return np.concatenate([edges[agree], together]), np.concatenate([matches[agree], firm])
+
+
+def _frame_edges(reconstruction: "pycolmap.Reconstruction", ids: IntArray) -> IntArray:
+    """Pairs (k, 2) of rows of images that follow each other in one frame of a rig."""
+    frames = np.array([reconstruction.image(i).frame_id for i in ids.tolist()], dtype=np.int64)
+    order = np.argsort(frames, kind="stable")
+    same = np.flatnonzero(np.diff(frames[order]) == 0)
+    return np.sort(np.stack([order[same], order[same + 1]], axis=1), axis=1)
 
 
 def _compared(

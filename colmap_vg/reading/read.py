@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, has_radial_term, with_focal_scale
 from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.pose_priors import read_pose_priors
+from colmap_vg.colmap_io.rigs import read_rigs
 from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
 from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
@@ -66,7 +67,8 @@ def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) 
     changed |= thinned
     focals = decide_focal_lengths(tables, options)
     priors, ignored = read_pose_priors(database_path, tables.image_ids.tolist())
-    graph = replace(_graph(tables, focals, changed, terms, options), priors=priors)
+    rigs = read_rigs(database_path, tables.image_ids)
+    graph = replace(_graph(tables, focals, changed, terms, options), priors=priors, rigs=rigs)
     return graph, (*tables.caveats, *focals.caveats, *ignored)
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.errors import GraphError
 from colmap_vg.scene.pose_priors import PosePriors
+from colmap_vg.scene.rigs import Rigs
 from colmap_vg.scene.verdicts import USED_EDGES, EdgeVerdict
 
 Array = NDArray[np.float64]
@@ -51,6 +52,8 @@ class ViewGraph:
         Names in the order of `image_ids`; empty when unknown.
     priors : PosePriors or None
         Measured positions and gravity of the images.
+    rigs : Rigs or None
+        Frames and sensors of the images; None where no rig has two cameras.
     camera_ids : (c,) int64 array or None
         Camera ids of the database.
     camera_focal_lengths : (c,) array or None
@@ -91,6 +94,7 @@ class ViewGraph:
     camera_idx: IntArray | None = None
     image_names: tuple[str, ...] = field(default=(), kw_only=True)
     priors: PosePriors | None = field(default=None, kw_only=True)
+    rigs: Rigs | None = field(default=None, kw_only=True)
     camera_ids: IntArray | None = field(default=None, kw_only=True)
     camera_focal_lengths: Array | None = field(default=None, kw_only=True)
     camera_focal_known: BoolArray | None = field(default=None, kw_only=True)
@@ -191,6 +195,8 @@ class ViewGraph:
             raise GraphError(f"ViewGraph.image_names has {len(self.image_names)} names for {n} images")
         if self.priors is not None and len(self.priors.positions) != n:
             raise GraphError(f"ViewGraph.priors are of {len(self.priors.positions)} images, expected {n}")
+        if self.rigs is not None and len(self.rigs.frame_idx) != n:
+            raise GraphError(f"ViewGraph.rigs are of {len(self.rigs.frame_idx)} images, expected {n}")
 
     def _check_values(self) -> None:
         n, edges, R, g = self.num_images, self.edges, self.cam2_from_cam1_rotations, self.cam2_in_cam1_directions

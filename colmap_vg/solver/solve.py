@@ -61,6 +61,7 @@ def solve_view_graph(
         part = state.largest_component(unsolved, ImageVerdict.SMALLER_COMPONENT)
         if part.num_images < MIN_PART_IMAGES:
             state.remove_images(part, ImageVerdict.SMALLER_COMPONENT)
+            state.link_by_rigs()
             return state.solution()
         solved, poses = _solve_part(state, part, options, initial[part.images])
         if poses is None:

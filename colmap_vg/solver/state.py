@@ -11,6 +11,7 @@ from colmap_vg.scene.subgraph import Subgraph
 from colmap_vg.scene.verdicts import USED_EDGES, EdgeVerdict, ImageVerdict, SolutionStatus
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.solver.agreement import pair_agreement
+from colmap_vg.solver.rig_links import link_components
 from colmap_vg.solver.rigidity import largest_rigid_component
 
 Array = NDArray[np.float64]
@@ -169,6 +170,22 @@ class SolverState:
             if radial_terms is not None:
                 self._radial_terms[own] = radial_terms[own]
             self._seen_cameras |= cameras
+
+    def link_by_rigs(self) -> None:
+        """Join components that frames of calibrated rigs link, and normalise the result as one component."""
+        rigs = self.graph.rigs
+        if rigs is None or self._component.max(initial=-1) < 1:
+            return
+        before, self._component = self._component, link_components(rigs, self._R, self._p, self._component)
+        for grown in np.unique(self._component[self._component != before]):
+            inside = self._component == grown
+            moved = self._p[inside] - self._p[inside].mean(axis=0)
+            self._p[inside] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+            self.caveats.append(
+                f"{int((inside & (before != grown)).sum())} images are linked to the others by their rig alone: no pair"
+                " confirms their place."
+            )
+        self._component[self._component >= 0] = np.unique(self._component[self._component >= 0], return_inverse=True)[1]
 
     def solution(self) -> PoseSolution:
         """Solution with all recorded poses, in the graph's order; unsolvable if there are none."""

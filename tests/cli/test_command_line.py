@@ -173,9 +173,14 @@ def test_a_database_without_verified_pairs_says_what_to_do(
 
 
 @pytest.mark.parametrize("verb", ["mapper", "solve"])
-def test_a_rig_is_refused(tmp_path: Path, verb: str) -> None:
-    make_database(tmp_path / "database.db", num_images=6, num_points=40, num_cameras_per_rig=2)
-    assert_refused(verb, tmp_path / "database.db", tmp_path / "out", "2 sensors", "rigs are not supported")
+def test_a_rig_is_mapped_with_its_frames(tmp_path: Path, verb: str) -> None:
+    make_database(tmp_path / "database.db", num_images=8, num_points=80, num_cameras_per_rig=2)
+    job = [verb, "--database_path", str(tmp_path / "database.db"), "--output_path", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, job)
+    assert result.exit_code == 0, result.output
+    model = pycolmap.Reconstruction(tmp_path / "out" / "0")
+    assert model.num_reg_frames() == 4
+    assert model.num_reg_images() == 8
 
 
 @pytest.mark.parametrize("verb", ["mapper", "solve"])

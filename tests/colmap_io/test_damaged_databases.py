@@ -115,12 +115,6 @@ def test_a_schema_that_is_no_text_is_named_whatever_sqlite_says_of_it(sound: Pat
         check_database(path)
 
 
-def test_rigs_are_refused_before_work_starts(tmp_path: Path) -> None:
-    make_database(tmp_path / "rig.db", num_images=6, num_points=40, num_cameras_per_rig=2)
-    with pytest.raises(DatabaseError, match="rig 1 has 2 sensors; rigs are not supported yet"):
-        check_database(tmp_path / "rig.db")
-
-
 def test_what_another_process_has_not_merged_yet_is_read(sound: Path, tmp_path: Path) -> None:
     """COLMAP writes in WAL mode: rows stand in DATABASE-wal until the last writer closes."""
     path = changed_copy(sound, tmp_path / "written.db", "PRAGMA journal_mode = WAL")

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from rig_scenes import render_rig
 from synthetic_databases import changed_copy, make_database
 from typer.main import get_command
 
@@ -175,7 +176,9 @@ def test_commands_run(page: str, words: list[str], workplace: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("words", WITH_PHOTOGRAPHS, ids=" ".join)
 def test_commands_on_photographs_run(words: tuple[str, ...], tmp_path: Path) -> None:
-    if words[0] != "demo":
+    if "--rigs" in words:
+        render_rig(tmp_path / "photos", num_frames=4)
+    elif words[0] != "demo":
         (tmp_path / "photos").mkdir()
         render_photographs(tmp_path / "photos", num_images=6)
     output = run_in(tmp_path, "-m", "colmap_vg", *words)

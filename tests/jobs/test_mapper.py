@@ -17,8 +17,8 @@ from synthetic_databases import (
 )
 
 from colmap_vg.colmap_io.database import check_database
-from colmap_vg.errors import DatabaseError, MappingError, OutputError
-from colmap_vg.events import StageEvent, StageLog
+from colmap_vg.errors import MappingError, OutputError
+from colmap_vg.events import StageLog
 from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.jobs import mapper
 from colmap_vg.jobs.mapper import MappingResult, map_database, view_graph_mapping
@@ -258,15 +258,6 @@ def test_two_images_are_too_few(tmp_path: Path) -> None:
     make_database(tmp_path / "a.db", num_images=2, num_points=100)
     with pytest.raises(MappingError, match=r"No three images .* add overlapping photographs"):
         view_graph_mapping(tmp_path / "a.db", None, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_rigs_are_refused_before_work_starts(tmp_path: Path) -> None:
-    make_database(tmp_path / "rig.db", num_images=8, num_points=60, num_cameras_per_rig=2)
-    events: list[StageEvent] = []
-    with pytest.raises(DatabaseError, match="rigs are not supported yet"):
-        view_graph_mapping(tmp_path / "rig.db", None, tmp_path / "out", on_event=events.append)
-    assert events == []
     assert not (tmp_path / "out").exists()
 
 
