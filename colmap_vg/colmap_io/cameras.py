@@ -15,6 +15,11 @@ MAX_REPROJECTION_PX = 0.5
 outside their field of view."""
 
 
+def focal_length(camera: "pycolmap.Camera") -> float:
+    """Mean focal length in pixels; of spherical cameras, which have none, the pixels of a radian."""
+    return float(camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length())
+
+
 def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Compute the unit rays of pixels in the camera's frame.
 
@@ -29,12 +34,17 @@ def bearings_of_keypoints(camera: "pycolmap.Camera", points: Array) -> tuple[Arr
     bearings : (k, 3) array
         Unit vectors; the optical axis where the camera model gives no ray.
     valid : (k,) bool array
-        Whether the ray is in front of the camera and projects back to its pixel.
+        Whether the ray projects back to its pixel; in front of the camera, unless that is spherical.
     """
     points = np.ascontiguousarray(points, dtype=float)
     rays = np.ones((len(points), 3))
     if len(points) == 0:
         return rays, np.zeros(0, dtype=bool)
+    if camera.is_spherical():
+        inside = np.isfinite(points).all(axis=1) & (points[:, 1] >= 0.0) & (points[:, 1] <= camera.height)
+        rays[:] = camera.cam_ray_from_img(np.where(inside[:, None], points, 0.0))
+        rays[~inside] = (0.0, 0.0, 1.0)
+        return normalized(rays), np.asarray(inside)
     rays[:, :2] = camera.cam_from_img(points)
     valid = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
     rays[~valid] = (0.0, 0.0, 1.0)
@@ -74,7 +84,13 @@ def undistorted_pixels(camera: "pycolmap.Camera", points: Array) -> tuple[Array,
 
 
 def calibration_matrix(camera: "pycolmap.Camera", focal_scale: float = 1.0) -> Array:
-    """Calibration matrix (3, 3) with the focal lengths multiplied by a factor."""
+    """Calibration matrix (3, 3) with the focal lengths multiplied by a factor.
+
+    That of a spherical camera is the pinhole camera's that touches the sphere at the middle of the image.
+    """
+    if camera.is_spherical():
+        f = focal_length(camera)
+        return np.array([[f, 0.0, 0.5 * camera.width], [0.0, f, 0.5 * camera.height], [0.0, 0.0, 1.0]])
     K = np.array(camera.calibration_matrix(), dtype=float)
     K[0, 0] *= focal_scale
     K[1, 1] *= focal_scale

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_vg.colmap_io.cameras import with_focal_scale, with_radial_term
+from colmap_vg.colmap_io.cameras import focal_length, with_focal_scale, with_radial_term
 from colmap_vg.colmap_io.database import working_copy
 from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.colmap_io.rigs import store_separated
@@ -148,9 +148,9 @@ def reconstruction_from_solution(
         ):
             if reconstruction.exists_camera(camera_id):
                 camera = reconstruction.camera(camera_id)
-                factor = float(focal * scale / camera.mean_focal_length())
+                factor = float(focal * scale / focal_length(camera))
                 # Left alone where nothing changed, so that given calibrations stay identical to the last bit.
-                if abs(factor - 1.0) > 1e-12:
+                if abs(factor - 1.0) > 1e-12 and not camera.is_spherical():
                     camera.params = with_focal_scale(camera, factor).params.tolist()
                 if term != 0.0:
                     camera.params = with_radial_term(camera, term).params.tolist()

@@ -77,6 +77,12 @@ class DatabaseTables:
     matches: IntArray
     caveats: tuple[str, ...] = ()
 
+    @property
+    def spherical(self) -> NDArray[np.bool_]:
+        """Mask (m,) of the pairs with a spherical camera, whose pixels no matrix relates."""
+        of_camera = np.array([camera.is_spherical() for camera in self.cameras], dtype=bool)
+        return np.asarray(of_camera[self.camera_idx[self.pairs]].any(axis=1))
+
     def matched_keypoints(self, rows: IntArray, pairs: IntArray, offsets: IntArray, side: int) -> IntArray:
         """Indices (k,) of matched keypoints in the concatenation of all images' keypoints.
 
@@ -128,8 +134,6 @@ class _Reader:
                 raise self._damaged(where, f"its {len(params)} parameters do not fit the model {camera.model_name}")
             if not (np.abs(params) < MAX_PARAMETER).all():
                 raise self._damaged(where, f"its parameters are {camera.params_to_string()}")
-            if camera.is_spherical():
-                raise DatabaseError(f"{self._path}: {where} is spherical; cut the panoramas into perspective images")
             focals = params[list(camera.focal_length_idxs())] / max(width, height)
             if not ((focals > MIN_FOCAL_SHARE) & (focals < MAX_FOCAL_SHARE)).all():
                 raise self._damaged(where, f"its focal length is {camera.mean_focal_length():g}")

@@ -97,6 +97,8 @@ def match_pair(first: ImageFeatures, second: ImageFeatures, options: pycolmap.Tw
         return PairMatches(matches, geometry)
     if not first.has_more and not second.has_more:
         return PairMatches(matches, geometry)
+    if first.camera.is_spherical() or second.camera.is_spherical():
+        return match_all_features(first, second, options)
     if _determines_lines(geometry):
         more = _near_lines(first, second, geometry)
     elif geometry.H is not None:

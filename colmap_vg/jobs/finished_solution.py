@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_vg.colmap_io.cameras import focal_length
 from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.mapping.build import BuildResult
 from colmap_vg.mapping.weak_cuts import WeakCut
@@ -110,5 +111,5 @@ def _focal_scales(
         used = {model.image(i).camera_id for i in model.reg_image_ids()}
         for row, camera_id in enumerate(graph.camera_ids.tolist()):
             if camera_id in used:
-                scales[row] = model.camera(camera_id).mean_focal_length() / graph.camera_focal_lengths[row]
+                scales[row] = focal_length(model.camera(camera_id)) / graph.camera_focal_lengths[row]
     return scales

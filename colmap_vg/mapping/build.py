@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_vg.colmap_io.cameras import focal_length
 from colmap_vg.events import StageLog
 from colmap_vg.mapping.bundle import adjust_bundle, placed_sensors
 from colmap_vg.mapping.lenses import reset_diverged_lenses
@@ -22,6 +23,7 @@ from colmap_vg.mapping.options import (
     triangulator_options,
 )
 from colmap_vg.mapping.pair_agreement import PairRotations, pair_agreement
+from colmap_vg.mapping.snapshot import TRADING_OFF
 from colmap_vg.mapping.support import supported_observations
 from colmap_vg.options import MappingOptions
 
@@ -103,13 +105,14 @@ def build_model(
         log.result(_state(reconstruction))
     with log.stage("register"):
         misplaced = _register_remaining(mapper, options, fixed, others, pairs, log)
-        reset_diverged_lenses(
+        named = reset_diverged_lenses(
             reconstruction,
             cache,
             options,
             log,
             lambda changed: _adjust(mapper, changed, fixed),
         )
+        _warn_of_unrefined(reconstruction, cache, options, named, log)
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
@@ -162,7 +165,7 @@ def _register_remaining(
 def _focal_lengths(reconstruction: "pycolmap.Reconstruction") -> NDArray[np.float64]:
     """Mean focal lengths of the cameras whose model is not in `WELL_INITIALIZED_MODELS`, pixels."""
     lenses = [lens for _, lens in sorted(reconstruction.cameras.items())]
-    return np.array([lens.mean_focal_length() for lens in lenses if lens.model_name not in WELL_INITIALIZED_MODELS])
+    return np.array([focal_length(lens) for lens in lenses if lens.model_name not in WELL_INITIALIZED_MODELS])
 
 
 def adjust_once_more(
@@ -285,6 +288,33 @@ def _warn_of_folds(reconstruction: "pycolmap.Reconstruction", pairs: PairRotatio
         names = sorted(reconstruction.image(i).name for i in found.contradicted)
         log.warn(f"The model's rotations of {len(names)} images contradict their pairs (first: {names[0]}).")
     return len(found.detached) > 0
+
+
+def _warn_of_unrefined(
+    reconstruction: "pycolmap.Reconstruction",
+    cache: "pycolmap.DatabaseCache",
+    options: MappingOptions,
+    named: frozenset[int],
+    log: StageLog,
+) -> None:
+    """Warn of distortion coefficients that were not refined since they ran away, see :func:`adjust_bundle`."""
+    if not options.ba_refine_extra_params or reconstruction.num_points3D() == 0:
+        return
+    used = sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()})
+    kept = [
+        camera_id
+        for camera_id in used
+        if camera_id not in named
+        and (places := reconstruction.camera(camera_id).extra_params_idxs())
+        and reconstruction.camera(camera_id).model_name in TRADING_OFF
+        and all(reconstruction.camera(camera_id).params[k] == cache.camera(camera_id).params[k] for k in places)
+    ]
+    if kept:
+        name = reconstruction.camera(kept[0]).model_name
+        log.warn(
+            f"The images do not determine the distortion coefficients of {len(kept)} {name} cameras (first: {kept[0]});"
+            " they are kept at their initial values."
+        )
 
 
 def _state(reconstruction: "pycolmap.Reconstruction") -> str:

@@ -5,15 +5,17 @@ Points of two views are refined afterwards with the cameras fixed.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
 import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
-from colmap_vg.geometry.directions import normalized
+from colmap_vg.colmap_io.cameras import bearings_of_keypoints, focal_length
 from colmap_vg.mapping.observations import Observations, keypoint_sigma, loss_scale
 from colmap_vg.mapping.options import MIN_TRACK_LENGTH, bundle_options
 from colmap_vg.mapping.point_refinement import refine_points
+from colmap_vg.mapping.snapshot import Snapshot
 from colmap_vg.options import MappingOptions
 
 
@@ -32,6 +34,8 @@ def adjust_bundle(
     fixed_sensors: Sequence["pycolmap.sensor_t"] = (),
 ) -> float:
     """Adjust cameras and points, in place.
+
+    Where distortion coefficients run away so far that points lose their projections, they are not refined.
 
     Parameters
     ----------
@@ -66,7 +70,12 @@ def adjust_bundle(
     else:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
+    before = Snapshot.of(reconstruction) if options.ba_refine_extra_params else None
     summary = adjuster.solve()
+    if before is not None and before.is_spoilt(reconstruction):
+        before.restore(reconstruction)
+        kept = replace(options, ba_refine_extra_params=False)
+        return adjust_bundle(reconstruction, kept, trial=trial, priors=priors, fixed_sensors=fixed_sensors)
     _move_short_tracks(reconstruction, scale)
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
@@ -105,9 +114,9 @@ def _move_short_tracks(reconstruction: "pycolmap.Reconstruction", scale_px: floa
     camera_ids = seen.camera_ids
     for camera_id in np.unique(camera_ids).tolist():
         camera, own = reconstruction.camera(camera_id), camera_ids == camera_id
-        # Keypoints that cannot be undistorted have NaN rays; their points do not move.
-        at = np.concatenate([camera.cam_from_img(seen.keypoints[own]), np.ones((own.sum(), 1))], axis=1)
-        rays[own], focal[own] = normalized(at), camera.mean_focal_length()
+        found, valid = bearings_of_keypoints(camera, seen.keypoints[own])
+        # Points of keypoints without a ray do not move.
+        rays[own], focal[own] = np.where(valid[:, None], found, np.nan), focal_length(camera)
     moved = refine_points(
         seen.positions,
         seen.point_row,

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_vg.colmap_io.cameras import bearings_of_keypoints, focal_length
 from colmap_vg.geometry.similarity import Similarity
 from colmap_vg.mapping.point_similarity import SeenPoints, similarity_of_points
 from colmap_vg.scene.view_graph import ViewGraph
@@ -166,15 +167,16 @@ def _seen_points(
     unique, row = np.unique(image_ids, return_inverse=True)
     images = [model.image(i) for i in unique.tolist()]
     poses = [image.cam_from_world().rotation.matrix() for image in images]
-    coordinates, focal = np.full((len(row), 2), np.nan), np.zeros(len(row))
+    rays, focal = np.full((len(row), 3), np.nan), np.zeros(len(row))
     for k, image in enumerate(images):
         own, camera = np.flatnonzero(row == k), model.camera(image.camera_id)
         pixels = np.array([image.point2D(p).xy for p in keypoints[own].tolist()])
-        coordinates[own], focal[own] = camera.cam_from_img(pixels), camera.mean_focal_length()
+        found, valid = bearings_of_keypoints(camera, pixels)
+        rays[own], focal[own] = np.where(valid[:, None], found, np.nan), focal_length(camera)
     return SeenPoints(
         np.array([model.point3D(i).xyz for i in point_ids.tolist()]),
         np.array(poses)[row],
         np.array([image.projection_center() for image in images])[row],
-        coordinates,
+        rays,
         focal,
     )

@@ -30,7 +30,7 @@ def reset_diverged_lenses(
     options: MappingOptions,
     log: StageLog,
     adjust: Callable[[MappingOptions], object],
-) -> None:
+) -> frozenset[int]:
     """Reset distortion coefficients that diverged, repeat bundle adjustment, and warn of them.
 
     Coefficients given at the start are reset to their initial values. Cameras that started without distortion are
@@ -46,6 +46,11 @@ def reset_diverged_lenses(
     log : StageLog
     adjust : callable
         Runs bundle adjustment of the reconstruction with the given options.
+
+    Returns
+    -------
+    frozenset of int
+        Ids of the cameras that a warning names.
     """
     diverged = _diverged(reconstruction) if options.ba_refine_extra_params else []
     given = [i for i in diverged if any(cache.camera(i).params[k] for k in cache.camera(i).extra_params_idxs())]
@@ -66,6 +71,7 @@ def reset_diverged_lenses(
         log.warn(f"The images do not determine {coefficients}; they are kept at their initial values.")
         adjust(replace(options, ba_refine_extra_params=False))
     _warn_of_diverged(reconstruction, log)
+    return frozenset(diverged)
 
 
 def _warn_of_diverged(reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:

@@ -107,6 +107,11 @@ def keypoint_sigma(reconstruction: "pycolmap.Reconstruction", min_track_length: 
     return _sigma(squared) if len(squared) else MIN_SIGMA_PX
 
 
+def num_projected(reconstruction: "pycolmap.Reconstruction") -> int:
+    """Number of observations of a sample of points that have a projection, whatever their error."""
+    return len(_squared_errors(reconstruction, 2))
+
+
 def _sigma(squared: Array) -> float:
     return max(float(np.sqrt(np.median(squared))) / _MEDIAN_NORM, MIN_SIGMA_PX)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.geometry.directions import normalized
 from colmap_vg.geometry.similarity import Similarity, align_positions, best_similarities
 
 Array = NDArray[np.float64]
@@ -30,8 +31,8 @@ class SeenPoints:
         cam_from_world of the image.
     centers : (k, 3) array
         Projection centre of the image, in the model's frame.
-    coordinates : (k, 2) array
-        Normalised image coordinates of the keypoint, dimensionless.
+    rays : (k, 3) array
+        Unit ray of the keypoint, in the camera's frame; NaN where it has none.
     focal_lengths : (k,) array
         Pixels.
     """
@@ -39,16 +40,14 @@ class SeenPoints:
     points: Array
     rotations: Array
     centers: Array
-    coordinates: Array
+    rays: Array
     focal_lengths: Array
 
     def errors(self, points: Array) -> Array:
-        """Reprojection errors (..., k), pixels, of other positions (..., k, 3); infinite behind the camera."""
+        """Errors (..., k) of other positions (..., k, 3): the distance from the ray on the unit sphere, in pixels."""
         local = np.einsum("kab,...kb->...ka", self.rotations, points - self.centers)
-        front = local[..., 2] > 0
-        seen = local[..., :2] / np.where(front, local[..., 2], 1.0)[..., None]
-        far = np.linalg.norm(seen - self.coordinates, axis=-1) * self.focal_lengths
-        return np.asarray(np.where(front, far, np.inf))
+        far = np.linalg.norm(normalized(local) - self.rays, axis=-1) * self.focal_lengths
+        return np.asarray(np.nan_to_num(far, nan=np.inf))
 
 
 def similarity_of_points(own: SeenPoints, other: SeenPoints, seed: int = 0) -> tuple[Similarity | None, BoolArray]:

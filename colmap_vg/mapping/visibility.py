@@ -71,7 +71,7 @@ def in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xy
         image = reconstruction.image(image_id)
         camera = reconstruction.camera(image.camera_id)
         local = image.cam_from_world() * xyz
-        front = np.flatnonzero(local[:, 2] > 0)
+        front = np.flatnonzero((local[:, 2] > 0) | camera.is_spherical())
         pixels = np.asarray(camera.img_from_cam(local[front]), dtype=np.float64).reshape(-1, 2)
         size = np.array([camera.width, camera.height])
         inside[front, column] = ((pixels >= 0) & (pixels < size)).all(axis=1)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.calibration.self_calibration import SelfCalibration, estimate_focal_lengths
+from colmap_vg.colmap_io.cameras import calibration_matrix
 from colmap_vg.colmap_io.tables import CALIBRATED, PANORAMIC, PLANAR, PLANAR_OR_PANORAMIC, UNCALIBRATED, DatabaseTables
 from colmap_vg.colmap_io.undistortion import undistorted_keypoints
 from colmap_vg.options import ReadOptions
@@ -59,7 +60,8 @@ class FocalDecision:
 
 def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalDecision:
     """Decide for each camera whether its focal length is kept, and by what factor it is changed otherwise."""
-    prior = np.array([c.has_prior_focal_length for c in tables.cameras], dtype=bool)
+    # Spherical cameras have no focal length that could be wrong.
+    prior = np.array([c.has_prior_focal_length or c.is_spherical() for c in tables.cameras], dtype=bool)
     as_given = np.ones(len(prior))
     if options.trust_focal_lengths == "always":
         return FocalDecision(as_given, np.ones(len(prior), dtype=bool), _contradictions(tables, options))
@@ -68,7 +70,7 @@ def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalD
 
 def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, ...]:
     """Sentences on focal lengths that are kept although image pairs contradict them."""
-    focals = np.array([c.focal_length_x for c in tables.cameras])
+    focals = _focal_lengths(tables)
     calibration = _self_calibration(tables, focals, np.ones(len(focals), dtype=bool), options)
     if calibration is None:
         return ()
@@ -86,11 +88,13 @@ def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, 
 
 
 def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> FocalDecision:
-    focals = np.array([c.focal_length_x for c in tables.cameras])
-    given = prior & (options.trust_focal_lengths != "never")
+    focals = _focal_lengths(tables)
+    spherical = np.array([c.is_spherical() for c in tables.cameras], dtype=bool)
+    given = (prior & (options.trust_focal_lengths != "never")) | spherical
     calibration = _self_calibration(tables, focals, given, options)
     if calibration is None:
-        return FocalDecision(np.ones(len(focals)), prior, (_why_unchecked(tables, options),))
+        unchecked = () if spherical.all() else (_why_unchecked(tables, options),)
+        return FocalDecision(np.ones(len(focals)), prior, unchecked)
     found = calibration.focal_lengths
     without = ~given & ~calibration.decided
     found = np.where(given, found, _in_common(tables, found, calibration, given))
@@ -162,7 +166,7 @@ def _self_calibration(
     tables: DatabaseTables, focals: Array, given: BoolArray, options: ReadOptions
 ) -> SelfCalibration | None:
     enough = np.diff(tables.offsets) >= max(options.min_num_inliers, MIN_MATCHES_PER_VOTE)
-    chosen = np.flatnonzero(np.isin(tables.configs, (CALIBRATED, UNCALIBRATED)) & enough)
+    chosen = np.flatnonzero(np.isin(tables.configs, (CALIBRATED, UNCALIBRATED)) & enough & ~tables.spherical)
     if len(chosen) == 0:
         return None
     chosen = chosen[_strongest_of_cameras(tables.camera_idx[tables.pairs[chosen]], np.diff(tables.offsets)[chosen])]
@@ -182,12 +186,16 @@ def _self_calibration(
         points1,
         points2,
         focals,
-        np.array([[c.principal_point_x, c.principal_point_y] for c in tables.cameras]),
+        np.array([calibration_matrix(c)[:2, 2] for c in tables.cameras]),
         np.array([[c.width, c.height] for c in tables.cameras], dtype=float),
         given=given,
         lens_groups=_lens_groups(tables.cameras),
-        aspect_ratios=np.array([c.focal_length_y / c.focal_length_x for c in tables.cameras]),
+        aspect_ratios=np.array([K[1, 1] / K[0, 0] for K in map(calibration_matrix, tables.cameras)]),
     )
+
+
+def _focal_lengths(tables: DatabaseTables) -> Array:
+    return np.array([calibration_matrix(camera)[0, 0] for camera in tables.cameras])
 
 
 def _strongest_of_cameras(cameras: IntArray, num_matches: IntArray) -> BoolArray:

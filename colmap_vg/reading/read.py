@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.cameras import bearings_of_keypoints, has_radial_term, with_focal_scale
+from colmap_vg.colmap_io.cameras import bearings_of_keypoints, focal_length, has_radial_term, with_focal_scale
 from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.pose_priors import read_pose_priors
 from colmap_vg.colmap_io.rigs import read_rigs
@@ -97,7 +97,7 @@ def _graph(
         camera_idx=tables.camera_idx,
         image_names=tables.image_names,
         camera_ids=np.array([c.camera_id for c in cameras], dtype=np.int64),
-        camera_focal_lengths=np.array([c.mean_focal_length() for c in cameras]),
+        camera_focal_lengths=np.array([focal_length(c) for c in cameras]),
         camera_focal_known=focals.known,
         camera_radial=np.array([has_radial_term(c) for c in cameras], dtype=bool),
         read_verdicts=verdicts,

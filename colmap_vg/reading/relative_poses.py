@@ -170,7 +170,7 @@ def relative_poses(
     cameras = tables.camera_idx[tables.pairs]
     K = np.array([calibration_matrix(c, s) for c, s in zip(tables.cameras, focal_scales, strict=True)])
     K = K.reshape(-1, 3, 3)
-    planar = np.isin(tables.configs, (PLANAR, PLANAR_OR_PANORAMIC))
+    planar = np.isin(tables.configs, (PLANAR, PLANAR_OR_PANORAMIC)) & ~tables.spherical
     unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
     poses = _initial_poses(tables, every.thinned(MAX_MATCHES_PER_CHOICE), K[cameras], planar, unchanged)
     focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
@@ -250,6 +250,7 @@ def _essential_matrices(tables: DatabaseTables, matches: _Matches, K1: Array, K2
     """Essential matrices: E if it was estimated with the same focal lengths, else from F, else from the matches."""
     E = np.where(unchanged[:, None, None], tables.E, np.nan)
     from_F = essential_from_fundamental(tables.F, K1, K2)
+    from_F[tables.spherical] = np.nan
     missing = ~_usable(E)
     E = np.where(missing[:, None, None], from_F, E)
     missing = ~_usable(E)

@@ -66,6 +66,7 @@ def with_verified_geometries(
     undistorted, valid = undistorted_keypoints(tables)
     raw = np.concatenate([*tables.keypoints, np.zeros((0, 2))]).astype(np.float64)
     judged = ~np.isin(tables.configs, (DEGENERATE, WATERMARK)) & (np.diff(tables.offsets) >= MIN_NUM_REFITTED)
+    judged &= ~tables.spherical
     as_seen = (raw,) if np.array_equal(raw, undistorted) else (raw, undistorted)
     unexplained = np.flatnonzero(judged & ~_explained(tables, as_seen))
     changed = np.zeros(len(tables.pairs), dtype=bool)

@@ -175,6 +175,6 @@ def _frustum_depth(centers: Array, diagonal: float) -> float:
 def _corner_rays(camera: "pycolmap.Camera") -> Array:
     """Rays through the corners of the image at depth 1, without distortion."""
     x, y = camera.width / 2, camera.height / 2
-    focal = camera.mean_focal_length()
+    focal = 0.5 * camera.width if camera.is_spherical() else camera.mean_focal_length()
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     return np.column_stack([signs * [x / focal, y / focal], np.ones(4)])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from colmap_vg.geometry import so3
+from colmap_vg.geometry.directions import normalized
 from colmap_vg.geometry.similarity import Similarity
 from colmap_vg.mapping.join import is_spread
 from colmap_vg.mapping.point_similarity import SeenPoints, similarity_of_points
@@ -16,8 +17,8 @@ def seen(points: np.ndarray, rotation: np.ndarray, center: np.ndarray, noise_px:
     k, f = len(points), 1000.0
     local = (points - center) @ rotation.T
     noise = noise_px / f * np.random.default_rng(seed).standard_normal((k, 2))
-    coordinates = local[:, :2] / local[:, 2:] + noise
-    return SeenPoints(points, np.tile(rotation, (k, 1, 1)), np.tile(center, (k, 1)), coordinates, np.full(k, f))
+    rays = normalized(np.column_stack([local[:, :2] / local[:, 2:] + noise, np.ones(k)]))
+    return SeenPoints(points, np.tile(rotation, (k, 1, 1)), np.tile(center, (k, 1)), rays, np.full(k, f))
 
 
 def two_models(num_points: int, num_wrong: int, noise_px: float, seed: int = 0) -> tuple[SeenPoints, SeenPoints]:
