@@ -82,6 +82,7 @@ class SolveOptions(_Checked):
 
     method: Method = "epipolar"
     rotation_averaging: RotationAveraging = "robust"
+    use_prior_gravity: bool = True  # refine averaged rotations by the measured gravity in the database
     certify_rotations: bool = False  # warn whether chordal rotations are a global optimum (by an eigenvalue)
     outlier_filter: OutlierFilter = "robust"
     rotation_gate_deg: float = _number(10.0, 0.0, 180.0)  # degrees; edges with a larger error are dropped; 0: no gate

@@ -25,6 +25,7 @@ REFINE_EXTRA_PARAMS = (
 )
 REFINE_INTRINSICS = ("--BundleAdjustment.optimize_intrinsics",)
 USE_PRIOR_POSITION = ("--use_prior_position", "--Mapper.use_prior_position", "--PosePrior.use_pose_position_prior")
+USE_PRIOR_GRAVITY = ("--use_prior_gravity", "--GlobalMapper.ra_use_gravity")
 EXTRACT_COLORS = ("--extract_colors", "--Mapper.extract_colors")
 NUM_THREADS = ("--num_threads", "--Mapper.num_threads", "--GlobalMapper.num_threads")
 RANDOM_SEED = ("--random_seed", "--seed", "--Mapper.random_seed", "--GlobalMapper.random_seed")
@@ -75,7 +76,7 @@ _IGNORED = {
         ba_refine_sensor_from_rig ba_refine_rig_from_world ba_refine_points3D ba_min_track_length ba_ceres_use_gpu
         ba_ceres_gpu_index ba_ceres_loss_function_scale ba_ceres_max_num_iterations ba_gpu_index
         ba_skip_fixed_rotation_stage ba_skip_joint_optimization_stage tri_complete_max_reproj_error
-        tri_merge_max_reproj_error tri_min_angle ra_use_gravity ra_use_stratified max_angular_reproj_error_deg
+        tri_merge_max_reproj_error tri_min_angle ra_use_stratified max_angular_reproj_error_deg
         max_normalized_reproj_error min_tri_angle_deg refine_sensor_from_rig
         """,
     "ViewGraphCalib.": "thres_lower_ratio thres_higher_ratio thres_two_view_error",
@@ -109,6 +110,7 @@ OBEYED = (
     *REFINE_EXTRA_PARAMS,
     *REFINE_INTRINSICS,
     *USE_PRIOR_POSITION,
+    *USE_PRIOR_GRAVITY,
     *EXTRACT_COLORS,
     *NUM_THREADS,
     *RANDOM_SEED,

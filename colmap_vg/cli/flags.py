@@ -204,6 +204,10 @@ class SolveFlags:
     edge_weights: Annotated[
         Literal["information", "inliers", "unit"], typer.Option("--edge_weights", help="How pairs are weighted.")
     ] = SolveOptions.edge_weights
+    use_prior_gravity: Annotated[
+        Switch,
+        _switch(*colmap_flags.USE_PRIOR_GRAVITY, help="Refine rotations by the measured gravity in the database."),
+    ] = "1"
     covariances: Annotated[
         Switch,
         _switch(

@@ -7,6 +7,7 @@ from colmap_vg.options import SolveOptions
 from colmap_vg.rotations.certificate import certify_chordal
 from colmap_vg.rotations.chordal import average_rotations_chordal
 from colmap_vg.rotations.consensus import ConsensusRotations, average_rotations_by_consensus
+from colmap_vg.rotations.gravity import refine_by_gravity
 from colmap_vg.rotations.refinement import refine_rotations
 from colmap_vg.scene.edge_residuals import rotation_residuals
 from colmap_vg.scene.solution import LogEntry
@@ -58,7 +59,7 @@ def average_rotations(
             state.log.extend(log)
             if options.certify_rotations:
                 _certify_rotations(state, part, relative, rotations, weights, options)
-            return rotations, part
+            return _with_gravity(state, part, relative, rotations, weights, options), part
         state.drop(part.edge_rows[bad], EdgeVerdict.ROTATION_OUTLIER)
         images = np.zeros(graph.num_images, dtype=bool)
         images[part.images] = True
@@ -77,6 +78,26 @@ def admit_confirmed_pairs(state: SolverState, part: Subgraph, rotations: Array, 
     residuals = rotation_residuals(trials.edges, graph.cam2_from_cam1_rotations[trials.edge_rows], rotations)
     state.restore(trials.edge_rows[residuals <= np.radians(options.rotation_gate_deg * TRIAL_SHARE)])
     return Subgraph.of(graph.edges, inside, state.usable)
+
+
+def _with_gravity(
+    state: SolverState, part: Subgraph, relative: Array, rotations: Array, weights: Array, options: SolveOptions
+) -> Array:
+    """Refine averaged rotations by measured gravity, if there is any; say which directions are wrong."""
+    priors = state.graph.priors
+    if priors is None or not options.use_prior_gravity or not priors.has_gravity[part.images].any():
+        return rotations
+    gravities = priors.gravities[part.images]
+    found = refine_by_gravity(part.num_images, part.edges, relative, weights, rotations, gravities, options.random_seed)
+    measured = np.isfinite(gravities).all(axis=1)
+    num, wrong = int(measured.sum()), int((measured & ~found.used).sum())
+    if wrong:
+        state.caveats.append(
+            f"{wrong} of {num} measured directions of gravity contradict the rotations and are not used."
+        )
+    if found.flipped.any():
+        state.caveats.append(f"{int(found.flipped.sum())} of {num} measured directions of gravity are upside down.")
+    return found.rotations
 
 
 def _doubt_rival(state: SolverState, part: Subgraph, found: ConsensusRotations) -> None:
