@@ -152,6 +152,7 @@ class MappingOptions(_Checked):
     ba_refine_extra_params: bool = True
     share_cameras: bool = True  # share intrinsics between images of the same size and initial calibration
     extract_colors: bool = True
+    fix_existing_frames: bool = True  # keep poses and calibrations of a model to start from (input_path) as they are
     use_prior_position: bool = True  # georeference models by the measured positions in the database
     overwrite: bool = False
     num_threads: int = _number(-1, -1)  # -1: all cores

@@ -25,6 +25,7 @@ REFINE_EXTRA_PARAMS = (
 )
 REFINE_INTRINSICS = ("--BundleAdjustment.optimize_intrinsics",)
 USE_PRIOR_POSITION = ("--use_prior_position", "--Mapper.use_prior_position", "--PosePrior.use_pose_position_prior")
+FIX_EXISTING_FRAMES = ("--fix_existing_frames", "--Mapper.fix_existing_frames", "--Mapper.fix_existing_images")
 USE_PRIOR_GRAVITY = ("--use_prior_gravity", "--GlobalMapper.ra_use_gravity")
 EXTRACT_COLORS = ("--extract_colors", "--Mapper.extract_colors")
 NUM_THREADS = ("--num_threads", "--Mapper.num_threads", "--GlobalMapper.num_threads")
@@ -39,7 +40,7 @@ ROTATION_GATE = ("--rotation_gate_deg", "--GlobalMapper.ra_max_rotation_error_de
 
 _IGNORED = {
     "": """
-        project_path log_to_stderr log_level log_target log_severity log_color default_random_seed input_path
+        project_path log_to_stderr log_level log_target log_severity log_color default_random_seed
         image_list_path constraint_type ba_iteration_num retriangulation_iteration_num output_format
         skip_preprocessing skip_view_graph_calibration skip_relative_pose_estimation skip_rotation_averaging
         skip_track_establishment skip_global_positioning skip_bundle_adjustment skip_retriangulation skip_pruning
@@ -57,7 +58,7 @@ _IGNORED = {
         ba_global_ignore_redundant_points3D ba_global_ignore_redundant_points3D_min_coverage_gain
         ba_global_prune_points_min_coverage_gain ba_use_gpu ba_gpu_index
         ba_min_num_residuals_for_cpu_multi_threading snapshot_path snapshot_images_freq snapshot_frames_freq
-        fix_existing_images fix_existing_frames init_min_num_inliers init_max_error init_max_forward_motion
+        init_min_num_inliers init_max_error init_max_forward_motion
         init_min_tri_angle init_max_reg_trials abs_pose_max_error abs_pose_min_num_inliers abs_pose_min_inlier_ratio
         abs_pose_refine_focal_length abs_pose_refine_extra_params filter_max_reproj_error filter_min_tri_angle
         max_reg_trials local_ba_min_tri_angle image_selection_method image_list_path constant_rig_list_path
@@ -109,6 +110,7 @@ OBEYED = (
     *REFINE_PRINCIPAL_POINT,
     *REFINE_EXTRA_PARAMS,
     *REFINE_INTRINSICS,
+    *FIX_EXISTING_FRAMES,
     *USE_PRIOR_POSITION,
     *USE_PRIOR_GRAVITY,
     *EXTRACT_COLORS,
@@ -121,12 +123,9 @@ OBEYED = (
 
 
 REFUSED = {
-    "--input_path": "a job starts from the database alone",
     "--image_list_path": "all images of the database are mapped",
     "--Mapper.image_list_path": "all images of the database are mapped",
     "--GlobalMapper.image_list_path": "all images of the database are mapped",
-    "--Mapper.fix_existing_images": "all cameras are adjusted",
-    "--Mapper.fix_existing_frames": "all cameras are adjusted",
     "--Mapper.max_extra_param": "no image is left out for the parameters of its camera",
     "--Mapper.constant_rig_list_path": "all cameras are adjusted",
     "--Mapper.constant_camera_list_path": "all intrinsics are adjusted, or none (--ba_refine_focal_length and others)",

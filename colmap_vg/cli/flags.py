@@ -67,6 +67,10 @@ Switch = Any
 ReportSwitch = Annotated[
     Switch, _switch("--report", help="Write OUT/report.html: a page to look at the result, without a network.")
 ]
+InputPath = Annotated[
+    Path | None,
+    typer.Option("--input_path", help="Folder of a model of some of the images. The others are added to it."),
+]
 RefineIntrinsics = Annotated[
     Switch,
     _switch(*colmap_flags.REFINE_INTRINSICS, help="Refine focal lengths and distortion coefficients (GLOMAP's flag)."),
@@ -235,6 +239,13 @@ class ModelFlags:
         _switch(
             "--share_cameras",
             help="Share intrinsics between images with the same initial calibration, unless they show different ones.",
+        ),
+    ] = "1"
+    fix_existing_frames: Annotated[
+        Switch,
+        _switch(
+            *colmap_flags.FIX_EXISTING_FRAMES,
+            help="Keep the poses and calibrations of the model of --input_path as they are.",
         ),
     ] = "1"
     use_prior_position: Annotated[

@@ -80,16 +80,20 @@ def mapper(
     resume: bool,
     reporter: Reporter,
     with_report: bool = True,
+    input_path: Path | None = None,
 ) -> None:
-    """From a database to models."""
+    """From a database to models, or from a database and a model to a larger one."""
     configure_colmap_log(reporter.verbose)
     asked = {"database_path": database_path, "image_path": image_path, "output_path": output_path, "mapping": options}
+    if input_path is not None:
+        asked["input_path"] = input_path
     with recorded_job(output_path, "mapper", asked, database_path, overwrite=options.overwrite, resume=resume) as job:
         if job.finished:
             reporter.say(DONE_BEFORE.format(output_path))
             return
         options = replace(options, overwrite=job.overwrite)
-        mapped = map_database(database_path, image_path, output_path, options, StageLog(reporter.on_event))
+        log = StageLog(reporter.on_event)
+        mapped = map_database(database_path, image_path, output_path, options, log, input_path)
         _finish("mapper", {**asked, "resume": resume}, mapped, output_path, reporter, with_report)
 
 

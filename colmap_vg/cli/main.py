@@ -69,6 +69,7 @@ def mapper(
     output_path: flags.OutputPath,
     image_path: flags.MapperImagePath = None,
     *,
+    input_path: flags.InputPath = None,
     solve: flags.SolveFlags,
     read: flags.ReadFlags,
     model: flags.ModelFlags,
@@ -93,7 +94,7 @@ def mapper(
             reporter.warn(f"{flag} has no counterpart in colmap-vg and is ignored")
         import colmap_vg.cli.jobs as jobs
 
-        jobs.mapper(database_path, image_path, output_path, options, job.resume, reporter, report)
+        jobs.mapper(database_path, image_path, output_path, options, job.resume, reporter, report, input_path)
 
 
 @app.command()

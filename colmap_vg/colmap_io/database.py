@@ -80,6 +80,18 @@ def check_database(database_path: str | PathLike[str]) -> None:
             )
 
 
+def image_names(database_path: str | PathLike[str]) -> set[str]:
+    """Names of all images of a checked database.
+
+    Raises
+    ------
+    DatabaseError
+        As for :func:`reading`.
+    """
+    with reading(database_path) as connection:
+        return {str(name) for (name,) in connection.execute("SELECT name FROM images")}
+
+
 def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:
     """Copy a checked database to a folder, for pycolmap to open.
 

@@ -13,7 +13,7 @@ from colmap_vg.mapping.build import BuildResult
 from colmap_vg.mapping.weak_cuts import WeakCut
 from colmap_vg.scene.edge_residuals import graph_residual_sigmas
 from colmap_vg.scene.solution import PoseSolution
-from colmap_vg.scene.verdicts import ImageVerdict
+from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.solver.agreement import pair_agreement
 from colmap_vg.solver.state import described
@@ -84,6 +84,35 @@ def solution_of_models(
         agreement=agreement,
         in_doubt=in_doubt,
     )
+
+
+def solution_of_reading(graph: ViewGraph) -> PoseSolution:
+    """A solution without poses: verdicts of a graph's edges from reading, and of images by whether they have edges."""
+    n, has_edges = graph.num_images, np.zeros(graph.num_images, dtype=bool)
+    has_edges[graph.edges[graph.has_rotation]] = True
+    return PoseSolution(
+        image_ids=graph.image_ids,
+        cam_from_world_rotations=np.full((n, 3, 3), np.nan),
+        projection_centers=np.full((n, 3), np.nan),
+        registered=np.zeros(n, dtype=bool),
+        component=np.full(n, -1),
+        focal_scales=np.ones(0 if graph.camera_ids is None else len(graph.camera_ids)),
+        edge_kept=graph.has_rotation,
+        edge_verdicts=np.full(graph.num_edges, str(EdgeVerdict.KEPT))
+        if graph.read_verdicts is None
+        else graph.read_verdicts,
+        image_verdicts=np.where(has_edges, str(ImageVerdict.FEW_OBSERVATIONS), str(ImageVerdict.NO_EDGES)),
+        status=SolutionStatus.PARTIAL,
+        message="",
+    )
+
+
+def with_edges_of_models(solution: PoseSolution, graph: ViewGraph) -> PoseSolution:
+    """The solution with the edges as not used that leave its models."""
+    ends = solution.component[graph.edges]
+    outside = solution.edge_kept & ((ends[:, 0] != ends[:, 1]) | (ends[:, 0] < 0))
+    verdicts = np.where(outside, str(EdgeVerdict.OUTSIDE), solution.edge_verdicts)
+    return replace(solution, edge_verdicts=verdicts, edge_kept=solution.edge_kept & ~outside)
 
 
 def _covariances_in_models(

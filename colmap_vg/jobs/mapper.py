@@ -7,32 +7,29 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.database import check_database
-from colmap_vg.colmap_io.loading import loaded_reconstruction
+from colmap_vg.colmap_io.database import check_database, image_names
 from colmap_vg.colmap_io.quiet import quiet_colmap
-from colmap_vg.colmap_io.raw_matches import compared_pairs
 from colmap_vg.colmap_io.reconstruction import loaded_cache, write_model
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cameras
 from colmap_vg.errors import MappingError
 from colmap_vg.events import StageEvent, StageLog
-from colmap_vg.jobs.finished_solution import solution_of_models
+from colmap_vg.jobs.finished_solution import solution_of_models, solution_of_reading, with_edges_of_models
+from colmap_vg.jobs.joining import BuiltModel, compared_images, join_models
 from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.mapping.build import (
     CONVERGED_COST_RATIO,
     MAX_NUM_ROUNDS,
-    BuildResult,
     adjust_once_more,
     build_model,
 )
 from colmap_vg.mapping.colors import extract_colors
+from colmap_vg.mapping.extension import extend_model, read_input_model
 from colmap_vg.mapping.georeference import Georeference, georeference
-from colmap_vg.mapping.join import Joint, joined_poses, joint_of
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.posed_model import posed_model, scale_is_uncertain, with_placed_sensors
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
-from colmap_vg.mapping.weak_cuts import WeakCut, cut_along, weak_cuts
+from colmap_vg.mapping.weak_cuts import WeakCut, weak_cuts
 from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.reading.read import read_with_caveats
 from colmap_vg.scene.solution import PoseSolution
@@ -81,6 +78,8 @@ def view_graph_mapping(
     output_path: str | PathLike[str],
     options: MappingOptions | None = None,
     on_event: Callable[[StageEvent], None] | None = None,
+    *,
+    input_path: str | PathLike[str] | None = None,
 ) -> dict[int, "pycolmap.Reconstruction"]:
     """Make models from a database of verified matches, as ``pycolmap.global_mapping`` does.
 
@@ -95,6 +94,8 @@ def view_graph_mapping(
     options : MappingOptions, optional
     on_event : callable, optional
         Called with a `StageEvent` whenever a stage starts, progresses, ends or warns.
+    input_path : path, optional
+        Folder of a model of some of the images, which the others are added to, in its frame.
 
     Returns
     -------
@@ -114,7 +115,7 @@ def view_graph_mapping(
     """
     options = MappingOptions.given(options)
     with quiet_colmap():
-        return map_database(database_path, image_path, output_path, options, StageLog(on_event)).models
+        return map_database(database_path, image_path, output_path, options, StageLog(on_event), input_path).models
 
 
 def map_database(
@@ -123,6 +124,7 @@ def map_database(
     output_path: str | PathLike[str],
     options: MappingOptions,
     log: StageLog,
+    input_path: str | PathLike[str] | None = None,
 ) -> MappingResult:
     """Make models as :func:`view_graph_mapping` does, with the caller's log; also return the graph and the solution.
 
@@ -131,6 +133,7 @@ def map_database(
     database_path, image_path, output_path, options
         As for :func:`view_graph_mapping`.
     log : StageLog
+    input_path : path, optional
 
     Returns
     -------
@@ -143,25 +146,18 @@ def map_database(
     """
     check_database(database_path)
     refuse_models(output_path, options.overwrite)
+    given = None if input_path is None else read_input_model(input_path, image_names(database_path))
     with work_folder(output_path, options.overwrite) as work:
         graph = _read(database_path, options, log)
-        solution = _solve(graph, options, log)
-        if not solution.registered.any():
-            raise MappingError(f"{database_path}: {solution.message}")
-        if solution.arrangements and graph.has_inliers and options.solve.method == "epipolar":
-            solution = _second_opinion(database_path, work, graph, solution, options, log)
-        built = _build(database_path, work, graph, solution, options, log)
-        if not built:
-            raise MappingError(
-                f"{database_path}: {int((solution.component >= 0).sum())} poses were solved, but no three images share"
-                " enough points with a sufficient triangulation angle; add overlapping photographs, taken from"
-                " different places"
-            )
+        if given is None:
+            solution, built = _solved_models(database_path, work, graph, options, log)
+        else:
+            solution, built = solution_of_reading(graph), [_extended(database_path, work, graph, given, options, log)]
         cuts = _weak_cuts(database_path, graph, built, log)
         with log.stage("write"):
             staged = stage_models(work, len(built))
             for folder, model in zip(staged, built, strict=True):
-                if model.georeference is None:
+                if model.georeference is None and given is None:
                     metric = graph.rigs is not None and graph.rigs.is_metric
                     model.reconstruction.normalize(fixed_scale=metric)
                 if options.extract_colors:
@@ -173,16 +169,45 @@ def map_database(
     finished = solution_of_models(
         solution, graph, [model.reconstruction for model in built], [model.result for model in built], cuts
     )
+    if given is not None:
+        finished = with_edges_of_models(finished, graph)
     return MappingResult(models, graph, finished, cuts, tuple(model.georeference for model in built))
 
 
-@dataclass(frozen=True)
-class _Model:
-    """A finished model and the result of building it."""
+def _solved_models(
+    database_path: str | PathLike[str], work: Path, graph: ViewGraph, options: MappingOptions, log: StageLog
+) -> tuple[PoseSolution, list[BuiltModel]]:
+    """Solve a viewing graph and build the models of its components."""
+    solution = _solve(graph, options, log)
+    if not solution.registered.any():
+        raise MappingError(f"{database_path}: {solution.message}")
+    if solution.arrangements and graph.has_inliers and options.solve.method == "epipolar":
+        solution = _second_opinion(database_path, work, graph, solution, options, log)
+    built = _build(database_path, work, graph, solution, options, log)
+    if not built:
+        raise MappingError(
+            f"{database_path}: {int((solution.component >= 0).sum())} poses were solved, but no three images share"
+            " enough points with a sufficient triangulation angle; add overlapping photographs, taken from"
+            " different places"
+        )
+    return solution, built
 
-    reconstruction: "pycolmap.Reconstruction"
-    result: BuildResult
-    georeference: Georeference | None = None
+
+def _extended(
+    database_path: str | PathLike[str],
+    work: Path,
+    graph: ViewGraph,
+    given: "pycolmap.Reconstruction",
+    options: MappingOptions,
+    log: StageLog,
+) -> BuiltModel:
+    """Add a database's images to a given model."""
+    with (
+        log.stage("load"),
+        loaded_cache(database_path, work, options.read.min_num_inliers, graph=graph) as (cache, _),
+    ):
+        pass
+    return BuiltModel(*extend_model(cache, given, options, log, _pair_rotations(graph)))
 
 
 def _build(
@@ -192,7 +217,7 @@ def _build(
     solution: PoseSolution,
     options: MappingOptions,
     log: StageLog,
-) -> list[_Model]:
+) -> list[BuiltModel]:
     """Build models of all components with enough points, and sort them by number of images, the largest first."""
     refined = options.ba_refine_focal_length or options.ba_refine_principal_point or options.ba_refine_extra_params
     shared = shared_cameras(graph) if options.share_cameras and refined and graph.rigs is None else []
@@ -217,19 +242,19 @@ def _build(
             posed = [posed_model(cache, solution, graph, component) for component in components]
         if replaced:
             log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
-    models: list[_Model] = []
+    models: list[BuiltModel] = []
     pairs = _pair_rotations(graph)
     for component, reconstruction in enumerate(posed):
         others = frozenset(solution.image_ids[~np.isin(solution.component, (-1, component))].tolist())
         result = build_model(cache, reconstruction, options, log, others, pairs)
         if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() > 0:
-            models.append(_Model(reconstruction, result))
+            models.append(BuiltModel(reconstruction, result))
         elif len(posed) > 1:
             count = int((solution.component == component).sum())
             log.warn(f"A component of {count} images shares too few points for a model of its own; it is dropped.")
     if len(models) > 1:
         usable = ~np.isin(solution.edge_verdicts, FALSE_PAIRS)
-        models = _joined(cache, models, graph, usable, pairs, _compared(database_path, graph), options, log)
+        models = join_models(cache, models, graph, usable, pairs, compared_images(database_path, graph), options, log)
     if models and replaced:
         with (
             log.stage("cameras"),
@@ -244,8 +269,8 @@ def _build(
 
 
 def _georeferenced(
-    cache: "pycolmap.DatabaseCache", models: list[_Model], graph: ViewGraph, options: MappingOptions, log: StageLog
-) -> list[_Model]:
+    cache: "pycolmap.DatabaseCache", models: list[BuiltModel], graph: ViewGraph, options: MappingOptions, log: StageLog
+) -> list[BuiltModel]:
     """Move models to the frame of their measured positions, if there are any and they are wanted."""
     priors = graph.priors
     if not options.use_prior_position or priors is None or not priors.has_position.any():
@@ -257,79 +282,6 @@ def _georeferenced(
         ]
         log.result(f"{sum(m.georeference is not None for m in placed)} of {len(models)} models georeferenced")
         return placed
-
-
-def _joined(
-    cache: "pycolmap.DatabaseCache",
-    models: list[_Model],
-    graph: ViewGraph,
-    usable: NDArray[np.bool_],
-    pairs: PairRotations,
-    compared: NDArray[np.int64],
-    options: MappingOptions,
-    log: StageLog,
-) -> list[_Model]:
-    """Join models whose shared points agree on the similarity between them, while the joined model is consistent."""
-    refused: set[frozenset[int]] = set()
-    while True:
-        with log.stage("join"):
-            models = sorted(models, key=lambda model: -model.reconstruction.num_reg_images())
-            first, second, joint = _best_joint(models, graph, usable, refused, options.random_seed)
-            if joint.similarity is None:
-                log.result("one model" if len(models) == 1 else f"{len(models)} models, none of which can be joined")
-                return models
-            own, other = models[first].reconstruction, models[second].reconstruction
-            log.result(
-                f"models of {own.num_reg_images()} and {other.num_reg_images()} images share {joint.num_shared} points,"
-                f" {joint.num_agreeing} of which agree on the similarity between them"
-            )
-        posed = joined_poses(loaded_reconstruction(cache), own, other, joint.similarity)
-        both, moved = set(posed.reg_image_ids()), set(other.reg_image_ids())
-        elsewhere = frozenset(
-            i for k, m in enumerate(models) if k not in (first, second) for i in m.reconstruction.reg_image_ids()
-        )
-        result = build_model(cache, posed, options, log, elsewhere, pairs)
-        cut = cut_along(posed, pairs, compared, moved)
-        if both <= set(posed.reg_image_ids()) and not result.folded and not cut.contradicted:
-            rest = [model for k, model in enumerate(models) if k not in (first, second)]
-            models = [*rest, _Model(posed, result)]
-            continue
-        refused.add(frozenset(own.reg_image_ids()) | frozenset(moved))
-        log.warn(
-            f"Models of {own.num_reg_images()} and {len(moved)} images share points, but are not joined: adjusted"
-            f" together they lose {len(both - set(posed.reg_image_ids()))} images, and both see a share of"
-            f" {cut.share_seen:.2f} of the points that both should see ({cut.share_seen_elsewhere:.2f} elsewhere)."
-        )
-
-
-def _compared(database_path: str | PathLike[str], graph: ViewGraph) -> NDArray[np.int64]:
-    """Image ids (k, 2) of the pairs that were compared, without those that the user excluded."""
-    pairs = np.sort(compared_pairs(database_path), axis=1)
-    if graph.read_verdicts is None:
-        return pairs
-    excluded = np.sort(graph.image_ids[graph.edges[graph.read_verdicts == EdgeVerdict.EXCLUDED]], axis=1)
-    known = set(map(tuple, excluded.tolist()))
-    return np.array([pair for pair in pairs.tolist() if tuple(pair) not in known], dtype=np.int64).reshape(-1, 2)
-
-
-def _best_joint(
-    models: Sequence[_Model],
-    graph: ViewGraph,
-    usable: NDArray[np.bool_],
-    refused: set[frozenset[int]],
-    seed: int,
-) -> tuple[int, int, Joint]:
-    """The two models with the most shared points that agree on a similarity; `Joint.similarity` is None without any."""
-    best = 0, 0, Joint(0, 0, None)
-    for a, one in enumerate(models):
-        for b in range(a + 1, len(models)):
-            own, other = one.reconstruction, models[b].reconstruction
-            if frozenset(own.reg_image_ids()) | frozenset(other.reg_image_ids()) in refused:
-                continue
-            joint = joint_of(own, other, graph, usable, seed)
-            if joint.similarity is not None and joint.num_agreeing > best[2].num_agreeing:
-                best = a, b, joint
-    return best
 
 
 def _second_opinion(
@@ -445,11 +397,11 @@ def _with_database_cameras(
 
 
 def _weak_cuts(
-    database_path: str | PathLike[str], graph: ViewGraph, models: Sequence[_Model], log: StageLog
+    database_path: str | PathLike[str], graph: ViewGraph, models: Sequence[BuiltModel], log: StageLog
 ) -> tuple[tuple[WeakCut, ...], ...]:
     """Find the weak cuts of each model, and warn of those that missing correspondences contradict."""
     with log.stage("check"):
-        compared, pairs = _compared(database_path, graph), _pair_rotations(graph)
+        compared, pairs = compared_images(database_path, graph), _pair_rotations(graph)
         found = tuple(weak_cuts(model.reconstruction, pairs, compared) for model in models)
         for model, cuts in zip(models, found, strict=True):
             for cut in cuts:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import focal_length
 from colmap_vg.events import StageLog
-from colmap_vg.mapping.bundle import adjust_bundle, placed_sensors
+from colmap_vg.mapping.bundle import Held, adjust_bundle, held_of
 from colmap_vg.mapping.lenses import reset_diverged_lenses
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
@@ -91,26 +91,20 @@ def build_model(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    triangulator, fixed = triangulator_options(options), placed_sensors(cache)
-    with log.stage("triangulate"):
-        image_ids = sorted(reconstruction.reg_image_ids())
-        for count, image_id in enumerate(image_ids, start=1):
-            mapper.triangulate_image(triangulator, image_id)
-            log.progress(f"{count} of {len(image_ids)} images", count / len(image_ids), count)
-        mapper.complete_and_merge_tracks(triangulator)
-        log.result(f"{reconstruction.num_points3D()} points")
+    held = held_of(cache)
+    triangulate_registered(mapper, options, log)
     with log.stage("adjust"):
-        if not _adjust_to_convergence(mapper, options, fixed):
+        if not _adjust_to_convergence(mapper, options, held):
             log.warn(f"Bundle adjustment did not converge in {MAX_NUM_ROUNDS} rounds; the model may be bent.")
         log.result(_state(reconstruction))
     with log.stage("register"):
-        misplaced = _register_remaining(mapper, options, fixed, others, pairs, log)
+        misplaced = _register_remaining(mapper, options, held, others, pairs, log)
         named = reset_diverged_lenses(
             reconstruction,
             cache,
             options,
             log,
-            lambda changed: _adjust(mapper, changed, fixed),
+            lambda changed: _adjust(mapper, changed, held),
         )
         _warn_of_unrefined(reconstruction, cache, options, named, log)
         folded = _warn_of_folds(reconstruction, pairs, log)
@@ -119,13 +113,63 @@ def build_model(
     return BuildResult(frozenset(misplaced), folded)
 
 
-def _adjust_to_convergence(
-    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, fixed: Sequence["pycolmap.sensor_t"]
-) -> bool:
+def triangulate_registered(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, log: StageLog) -> None:
+    """Triangulate the points of all registered images, as a stage."""
+    triangulator = triangulator_options(options)
+    with log.stage("triangulate"):
+        image_ids = sorted(mapper.reconstruction.reg_image_ids())
+        for count, image_id in enumerate(image_ids, start=1):
+            mapper.triangulate_image(triangulator, image_id)
+            log.progress(f"{count} of {len(image_ids)} images", count / len(image_ids), count)
+        mapper.complete_and_merge_tracks(triangulator)
+        log.result(f"{mapper.reconstruction.num_points3D()} points")
+
+
+def finish_registration(
+    mapper: "pycolmap.IncrementalMapper",
+    options: MappingOptions,
+    log: StageLog,
+    pairs: PairRotations,
+    held: Held,
+    kept_frames: frozenset[int],
+) -> BuildResult:
+    """Register images by the points of a finished model, and adjust it, as a stage.
+
+    Parameters
+    ----------
+    mapper : pycolmap.IncrementalMapper
+        Of a model with points.
+    options : MappingOptions
+    log : StageLog
+    pairs : PairRotations
+        Relative rotations to check the added images against.
+    held : Held
+        What is not adjusted.
+    kept_frames : frozenset of int
+        Ids of frames that stay registered in any case.
+    """
+    model, added, misplaced = mapper.reconstruction, set[int](), set[int]()
+    with log.stage("register"):
+        while True:
+            found = _register_left_out(mapper, options, frozenset(misplaced))
+            wrong = _remove_misplaced(mapper, found, pairs)
+            misplaced, found = misplaced | wrong, found - wrong
+            if not found:
+                break
+            added |= found
+            mapper.complete_and_merge_tracks(triangulator_options(options))
+            _adjust(mapper, options, held)
+            added -= _remove_unsupported(mapper, kept_frames)
+        folded = _warn_of_folds(model, pairs, log)
+        log.result(f"{len(added)} images added, {_state(model)}")
+    return BuildResult(frozenset(misplaced), folded)
+
+
+def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, held: Held) -> bool:
     """Alternate bundle adjustment and retriangulation; return whether they converged in `MAX_NUM_ROUNDS` rounds."""
     triangulator = triangulator_options(options)
     lenses = _focal_lengths(mapper.reconstruction)
-    cost_ratio, enough = _adjust(mapper, options, fixed), GOOD_START_COST_RATIO
+    cost_ratio, enough = _adjust(mapper, options, held), GOOD_START_COST_RATIO
     for _ in range(MAX_NUM_ROUNDS):
         before, lenses = lenses, _focal_lengths(mapper.reconstruction)
         mapper.complete_and_merge_tracks(triangulator)
@@ -133,7 +177,7 @@ def _adjust_to_convergence(
         _filter(mapper)
         if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
             return True
-        cost_ratio = _adjust(mapper, options, fixed)
+        cost_ratio = _adjust(mapper, options, held)
         enough = CONVERGED_COST_RATIO
     return False
 
@@ -141,7 +185,7 @@ def _adjust_to_convergence(
 def _register_remaining(
     mapper: "pycolmap.IncrementalMapper",
     options: MappingOptions,
-    fixed: Sequence["pycolmap.sensor_t"],
+    held: Held,
     others: frozenset[int],
     pairs: PairRotations | None,
     log: StageLog,
@@ -155,7 +199,7 @@ def _register_remaining(
     added -= misplaced
     if added or removed or misplaced:
         mapper.complete_and_merge_tracks(triangulator_options(options))
-        _adjust(mapper, options, fixed)
+        _adjust(mapper, options, held)
         again = _remove_unsupported(mapper)
         removed, added = removed | again, added - again
     log.result(f"{len(added)} images added, {len(removed)} removed")
@@ -195,7 +239,7 @@ def adjust_once_more(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    share = _adjust(mapper, options, placed_sensors(cache), trial=trial, priors=priors)
+    share = _adjust(mapper, options, held_of(cache), trial=trial, priors=priors)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return share
@@ -204,13 +248,13 @@ def adjust_once_more(
 def _adjust(
     mapper: "pycolmap.IncrementalMapper",
     options: MappingOptions,
-    fixed: Sequence["pycolmap.sensor_t"],
+    held: Held,
     *,
     trial: bool = False,
     priors: Sequence["pycolmap.PosePrior"] = (),
 ) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
-    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial, priors=priors, fixed_sensors=fixed)
+    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial, priors=priors, held=held)
     _filter(mapper)
     return cost_ratio
 
@@ -220,7 +264,7 @@ def _filter(mapper: "pycolmap.IncrementalMapper") -> None:
     mapper.observation_manager.filter_all_points3D(MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG)
 
 
-def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
+def _remove_unsupported(mapper: "pycolmap.IncrementalMapper", kept_frames: frozenset[int] = frozenset()) -> set[int]:
     """Deregister frames with too few observations of well-triangulated points, weakest first; return their images."""
     reconstruction = mapper.reconstruction
     removed: set[int] = set()
@@ -228,7 +272,11 @@ def _remove_unsupported(mapper: "pycolmap.IncrementalMapper") -> set[int]:
         support: Counter[int] = Counter()
         for image_id, count in supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG).items():
             support[reconstruction.image(image_id).frame_id] += count
-        weak = [(count, frame_id) for frame_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]
+        weak = [
+            (count, frame_id)
+            for frame_id, count in support.items()
+            if count < MIN_SUPPORTED_OBSERVATIONS and frame_id not in kept_frames
+        ]
         if not weak:
             return removed
         _, frame_id = min(weak)

@@ -5,7 +5,7 @@ Points of two views are refined afterwards with the cameras fixed.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -19,10 +19,30 @@ from colmap_vg.mapping.snapshot import Snapshot
 from colmap_vg.options import MappingOptions
 
 
-def placed_sensors(cache: "pycolmap.DatabaseCache") -> list["pycolmap.sensor_t"]:
-    """Sensors whose place in their rig is known, so that bundle adjustment leaves it."""
+@dataclass(frozen=True)
+class Held:
+    """What bundle adjustment leaves as it is.
+
+    Attributes
+    ----------
+    sensors : sequence of pycolmap.sensor_t
+        Sensors whose place in their rig is kept; distances between them fix the scale.
+    frames : frozenset of int
+        Ids of frames whose poses are kept, with the calibrations of their cameras.
+    """
+
+    sensors: Sequence["pycolmap.sensor_t"] = ()
+    frames: frozenset[int] = frozenset()
+
+
+NOTHING_HELD = Held()
+
+
+def held_of(cache: "pycolmap.DatabaseCache", frames: frozenset[int] = frozenset()) -> Held:
+    """Hold the sensors whose place in their rig the database knows, and some frames."""
     rigs = [rig for _, rig in sorted(cache.rigs.items())]
-    return [sensor for rig in rigs for sensor in rig.non_ref_sensors if rig.has_sensor_from_rig(sensor)]
+    sensors = [sensor for rig in rigs for sensor in rig.non_ref_sensors if rig.has_sensor_from_rig(sensor)]
+    return Held(sensors, frames)
 
 
 def adjust_bundle(
@@ -31,7 +51,7 @@ def adjust_bundle(
     *,
     trial: bool = False,
     priors: Sequence["pycolmap.PosePrior"] = (),
-    fixed_sensors: Sequence["pycolmap.sensor_t"] = (),
+    held: Held = NOTHING_HELD,
 ) -> float:
     """Adjust cameras and points, in place.
 
@@ -46,8 +66,7 @@ def adjust_bundle(
     priors : sequence of pycolmap.PosePrior, optional
         Positions of three images or more in the frame of the reconstruction, with covariances in its unit; they fix
         the gauge.
-    fixed_sensors : sequence of pycolmap.sensor_t, optional
-        Sensors whose place in their rig is not adjusted; distances between them fix the scale.
+    held : Held, optional
 
     Returns
     -------
@@ -58,13 +77,18 @@ def adjust_bundle(
     bundle = bundle_options(options, loss_scale_px=scale, trial=trial)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
-        config.add_image(image_id)
-    for sensor in fixed_sensors:
+        if reconstruction.image(image_id).frame_id not in held.frames:
+            config.add_image(image_id)
+    for sensor in held.sensors:
         config.set_constant_sensor_from_rig_pose(sensor)
+    if held.frames:
+        _hold_frames(reconstruction, config, held.frames)
     if priors:
         told, weighted = pycolmap.PosePriorBundleAdjustmentOptions(), _weighted(priors, reconstruction)
         adjuster = pycolmap.create_pose_prior_bundle_adjuster(bundle, told, config, weighted, reconstruction)
-    elif is_metric(reconstruction, fixed_sensors):
+    elif held.frames:
+        adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
+    elif is_metric(reconstruction, held.sensors):
         config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
         adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
     else:
@@ -75,19 +99,34 @@ def adjust_bundle(
     if before is not None and before.is_spoilt(reconstruction):
         before.restore(reconstruction)
         kept = replace(options, ba_refine_extra_params=False)
-        return adjust_bundle(reconstruction, kept, trial=trial, priors=priors, fixed_sensors=fixed_sensors)
+        return adjust_bundle(reconstruction, kept, trial=trial, priors=priors, held=held)
     _move_short_tracks(reconstruction, scale)
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
 
 
-def is_metric(reconstruction: "pycolmap.Reconstruction", fixed_sensors: Sequence["pycolmap.sensor_t"]) -> bool:
+def _hold_frames(
+    reconstruction: "pycolmap.Reconstruction", config: "pycolmap.BundleAdjustmentConfig", frames: frozenset[int]
+) -> None:
+    """Keep the cameras of frames; points that other images see move, with all their observations."""
+    seen: set[int] = set()
+    for image_id in sorted(reconstruction.reg_image_ids()):
+        image = reconstruction.image(image_id)
+        if image.frame_id in frames:
+            config.set_constant_cam_intrinsics(image.camera_id)
+        else:
+            seen.update(point.point3D_id for point in image.get_observation_points2D())
+    for point_id in sorted(seen):
+        config.add_variable_point(point_id)
+
+
+def is_metric(reconstruction: "pycolmap.Reconstruction", sensors: Sequence["pycolmap.sensor_t"]) -> bool:
     """Whether sensors at fixed distances from their rig's origin determine the scale of a model."""
     distances = [
         float(np.linalg.norm(rig.sensor_from_rig(sensor).translation))
         for _, rig in sorted(reconstruction.rigs.items())
-        for sensor in fixed_sensors
+        for sensor in sensors
         if rig.has_sensor(sensor)
     ]
     return max(distances, default=0.0) > 0.0

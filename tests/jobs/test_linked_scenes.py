@@ -20,7 +20,7 @@ from colmap_vg import (
 )
 from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
-from colmap_vg.jobs import mapper
+from colmap_vg.jobs import joining
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict
 
@@ -108,7 +108,7 @@ def test_pairs_that_the_user_excludes_join_nothing_and_are_not_missed(tmp_path: 
         assert len(result.models) == count
         assert not log.warnings
         assert result.solution.status == (SolutionStatus.SOLVED if count == 1 else SolutionStatus.PARTIAL)
-        compared = {tuple(pair) for pair in mapper._compared(tmp_path / "a.db", result.graph).tolist()}
+        compared = {tuple(pair) for pair in joining.compared_images(tmp_path / "a.db", result.graph).tolist()}
         used = [pair for pair in near(20, 3) if pair not in across or pair == kept]
         assert compared == {(i + 1, j + 1) for i, j in used}
 

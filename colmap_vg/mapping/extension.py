@@ -1,0 +1,167 @@
+"""Extend an existing model by the other images of a database, with its cameras fixed or adjusted too."""
+
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.loading import loaded_reconstruction
+from colmap_vg.errors import DataFileError
+from colmap_vg.events import StageLog
+from colmap_vg.geometry.similarity import align_positions
+from colmap_vg.mapping.build import BuildResult, finish_registration, triangulate_registered
+from colmap_vg.mapping.bundle import held_of
+from colmap_vg.mapping.pair_agreement import PairRotations
+from colmap_vg.options import MappingOptions
+
+Array = NDArray[np.float64]
+
+NUM_COMPARED, SAME_KEYPOINT_PX = 20, 0.01
+"""Number of keypoints of each image that are compared, and maximum distance between those that are the same, pixels."""
+
+
+def read_input_model(input_path: str | PathLike[str], image_names: set[str]) -> "pycolmap.Reconstruction":
+    """Read a model to start from.
+
+    Parameters
+    ----------
+    input_path : path
+        Folder of a COLMAP model, binary or text.
+    image_names : set of str
+        Names of the database's images.
+
+    Raises
+    ------
+    DataFileError
+        The model cannot be read, has fewer than two registered images, or images that the database lacks.
+    """
+    if not Path(input_path).is_dir():
+        raise DataFileError(f"{input_path}: no such folder; input_path is the folder of a COLMAP model")
+    try:
+        model = pycolmap.Reconstruction(input_path)
+    except (ValueError, RuntimeError, OSError, IndexError) as error:
+        raise DataFileError(f"{input_path}: is no COLMAP model that can be read ({error})") from error
+    names = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    if len(names) < 2:
+        raise DataFileError(f"{input_path}: has {len(names)} registered images; a model to start from needs two")
+    lacking = sorted(names - image_names)
+    if lacking:
+        raise DataFileError(
+            f"{input_path}: {len(lacking)} of its {len(names)} images are not in the database (first: {lacking[0]});"
+            " match all images in one database, under the names that they have in the model"
+        )
+    return model
+
+
+def extend_model(
+    cache: "pycolmap.DatabaseCache",
+    given: "pycolmap.Reconstruction",
+    options: MappingOptions,
+    log: StageLog,
+    pairs: PairRotations,
+) -> tuple["pycolmap.Reconstruction", BuildResult]:
+    """Register a database's other images in an existing model.
+
+    With `fix_existing_frames` the model's poses and calibrations stay as they are, else they are adjusted and the
+    result is aligned to them.
+
+    Parameters
+    ----------
+    cache : pycolmap.DatabaseCache
+    given : pycolmap.Reconstruction
+        From `read_input_model`.
+    options : MappingOptions
+    log : StageLog
+    pairs : PairRotations
+        Of the database, to check the added images against.
+
+    Returns
+    -------
+    reconstruction : pycolmap.Reconstruction
+        In the frame of the given model.
+    result : BuildResult
+    """
+    with log.stage("extend"):
+        model = loaded_reconstruction(cache)
+        ids = {image.name: image_id for image_id, image in model.images.items()}
+        old = {image_id: ids[given.image(image_id).name] for image_id in sorted(given.reg_image_ids())}
+        _copy_cameras(given, model, old, log)
+        _copy_poses(given, model, old)
+        copied = _copy_points(given, model, old)
+        log.result(f"{len(old)} images and {copied} points of the given model")
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    if copied == 0:
+        triangulate_registered(mapper, options, log)
+    frames = {model.image(image_id).frame_id for image_id in old.values()}
+    held = held_of(cache, frozenset(frames) if options.fix_existing_frames else frozenset())
+    result = finish_registration(mapper, options, log, pairs, held, frozenset(frames))
+    mapper.end_reconstruction(False)
+    if not options.fix_existing_frames:
+        _align(given, model, old)
+    model.update_point_3d_errors()
+    return model, result
+
+
+def _copy_cameras(
+    given: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", old: dict[int, int], log: StageLog
+) -> None:
+    """Give the database's cameras the calibrations of the given model's, and warn of cameras with several."""
+    done: dict[int, int] = {}
+    several = set()
+    for image_id, new_id in old.items():
+        camera_id, camera = model.image(new_id).camera_id, given.camera(given.image(image_id).camera_id)
+        if done.setdefault(camera_id, camera.camera_id) == camera.camera_id:
+            target = model.camera(camera_id)
+            target.model, target.params = camera.model, camera.params.tolist()
+        else:
+            several.add(camera_id)
+    if several:
+        log.warn(
+            f"{len(several)} cameras of the database have several calibrations in the given model (first:"
+            f" {min(several)}); that of their first image is taken."
+        )
+
+
+def _copy_poses(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", old: dict[int, int]) -> None:
+    for rig in given.rigs.values():
+        for sensor in rig.non_ref_sensors:
+            pose = rig.sensor_from_rig(sensor)
+            own = [r for r in model.rigs.values() if r.has_sensor(sensor) and not r.is_ref_sensor(sensor)]
+            if pose is not None and own:
+                own[0].set_sensor_from_rig(sensor, pose)
+    for image_id, new_id in old.items():
+        image = model.image(new_id)
+        frame = model.frame(image.frame_id)
+        if not frame.has_pose():
+            frame.set_cam_from_world(image.camera_id, given.image(image_id).cam_from_world())
+            model.register_frame(image.frame_id)
+
+
+def _copy_points(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", old: dict[int, int]) -> int:
+    """Copy the points if a sample of the keypoints of all images are the database's; return their number."""
+    for image_id, new_id in old.items():
+        own, theirs = model.image(new_id), given.image(image_id)
+        if own.num_points2D() != theirs.num_points2D():
+            return 0
+        for place in np.linspace(0, own.num_points2D() - 1, NUM_COMPARED).astype(int).tolist():
+            far = own.point2D(place).xy - theirs.point2D(place).xy
+            if np.abs(far).max() > SAME_KEYPOINT_PX:
+                return 0
+    for _, point in sorted(given.points3D.items()):
+        track = pycolmap.Track()
+        for element in point.track.elements:
+            track.add_element(old[element.image_id], element.point2D_idx)
+        model.add_point3D(np.asarray(point.xyz), track, np.asarray(point.color))
+    return int(given.num_points3D())
+
+
+def _align(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", old: dict[int, int]) -> None:
+    """Move the adjusted model to where its cameras fit those of the given one best."""
+    both = [(image_id, new_id) for image_id, new_id in old.items() if model.image(new_id).has_pose]
+    centers = [np.array([m.image(pair[k]).projection_center() for pair in both]) for k, m in enumerate((given, model))]
+    _, similarity = align_positions(centers[1], centers[0])
+    rotation = pycolmap.Rotation3d(similarity.rotation)
+    model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))

@@ -1,0 +1,168 @@
+"""Jobs that start from a model: its cameras stay, the other images are added as a joint job would place them."""
+
+import shutil
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from rig_scenes import make_rigs
+from typer.testing import CliRunner
+
+from colmap_vg import MappingOptions, align_positions, view_graph_mapping
+from colmap_vg.cli.main import app
+from colmap_vg.errors import DataFileError
+from colmap_vg.events import StageLog
+from colmap_vg.jobs.mapper import map_database
+from colmap_vg.simulation.database import write_synthetic_database
+from colmap_vg.simulation.views import synthetic_views
+
+OPTIONS = MappingOptions(num_threads=1, extract_colors=False)
+NEW = (3, 8, 13, 18, 23)
+"""Ids of the images that are added."""
+MAX_NUM_IMAGES = 2_147_483_647
+
+
+def without_images(path: Path, target: Path, ids: tuple[int, ...]) -> Path:
+    """A copy of a database without some images."""
+    shutil.copyfile(path, target)
+    with closing(sqlite3.connect(target)) as connection, connection:
+        for table in ("two_view_geometries", "matches"):
+            for (pair,) in connection.execute(f"SELECT pair_id FROM {table}").fetchall():
+                if pair // MAX_NUM_IMAGES in ids or pair % MAX_NUM_IMAGES in ids:
+                    connection.execute(f"DELETE FROM {table} WHERE pair_id = ?", (pair,))
+        for image_id in ids:
+            connection.execute("DELETE FROM images WHERE image_id = ?", (image_id,))
+            connection.execute("DELETE FROM keypoints WHERE image_id = ?", (image_id,))
+            connection.execute("DELETE FROM frame_data WHERE data_id = ?", (image_id,))
+        connection.execute("DELETE FROM frames WHERE frame_id NOT IN (SELECT frame_id FROM frame_data)")
+    return target
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``all.db`` of 25 images, the model ``old`` of 20 of them, and the model ``joint`` of all."""
+    folder = tmp_path_factory.mktemp("extension")
+    write_synthetic_database(folder / "all.db", synthetic_views("drone", 25, noise_px=0.5))
+    part = without_images(folder / "all.db", folder / "part.db", NEW)
+    view_graph_mapping(part, None, folder / "old", OPTIONS)
+    view_graph_mapping(folder / "all.db", None, folder / "joint", OPTIONS)
+    return folder
+
+
+def poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    return {model.image(i).name: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
+
+
+def centers(model: pycolmap.Reconstruction, names: list[str]) -> np.ndarray:
+    by_name = {model.image(i).name: model.image(i).projection_center() for i in model.reg_image_ids()}
+    return np.array([by_name[name] for name in names])
+
+
+def radius(points: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+def test_old_poses_stay_and_new_ones_are_as_of_a_joint_job(scene: Path, tmp_path: Path, fixed: bool) -> None:
+    old, joint = pycolmap.Reconstruction(scene / "old" / "0"), pycolmap.Reconstruction(scene / "joint" / "0")
+    log = StageLog()
+    options = replace(OPTIONS, fix_existing_frames=fixed)
+    result = map_database(scene / "all.db", None, tmp_path / "out", options, log, scene / "old" / "0")
+    model = result.models[0]
+    assert log.warnings == []
+    assert [record.stage for record in log.records] == ["view graph", "load", "extend", "register", "check", "write"]
+    assert (old.num_reg_images(), model.num_reg_images()) == (20, 25)
+    before, after = poses(old), poses(model)
+    if fixed:
+        for name, pose in before.items():
+            np.testing.assert_allclose(after[name], pose, atol=1e-9)
+    names = sorted(before)
+    moved = np.linalg.norm(centers(model, names) - centers(old, names), axis=1)
+    assert moved.max() < 1e-3 * radius(centers(old, names))
+    new = sorted(set(after) - set(before))
+    assert len(new) == 5
+    distances, _ = align_positions(centers(model, names + new), centers(joint, names + new))
+    assert distances[-5:].max() < 1e-3 * radius(centers(joint, names + new))
+    assert result.solution.registered.all()
+    assert result.solution.agreement[0].inliers > 0.95
+    assert model.num_points3D() > old.num_points3D()
+    written = pycolmap.Reconstruction(tmp_path / "out" / "0")
+    np.testing.assert_allclose(centers(written, names + new), centers(model, names + new))
+
+
+def test_a_model_of_other_keypoints_gives_its_poses_only(scene: Path, tmp_path: Path) -> None:
+    """As one that was made with other features: its points are triangulated anew."""
+    old, bare = pycolmap.Reconstruction(scene / "old" / "0"), pycolmap.Reconstruction()
+    bare.add_camera_with_trivial_rig(pycolmap.Camera(old.camera(1).todict()))
+    for image_id in old.reg_image_ids():
+        image = pycolmap.Image(name=old.image(image_id).name, camera_id=1, image_id=image_id)
+        bare.add_image_with_trivial_frame(image, old.image(image_id).cam_from_world())
+    (tmp_path / "bare").mkdir()
+    bare.write(tmp_path / "bare")
+    models = view_graph_mapping(scene / "all.db", None, tmp_path / "out", OPTIONS, input_path=tmp_path / "bare")
+    assert models[0].num_reg_images() == 25
+    joint = pycolmap.Reconstruction(scene / "joint" / "0")
+    names = sorted(poses(joint))
+    distances, _ = align_positions(centers(models[0], names), centers(joint, names))
+    assert distances.max() < 1e-3 * radius(centers(joint, names))
+
+
+def test_images_that_do_not_belong_are_left_out_with_a_reason(scene: Path, tmp_path: Path) -> None:
+    lone = tmp_path / "lone.db"
+    shutil.copyfile(scene / "all.db", lone)
+    with closing(sqlite3.connect(lone)) as connection, connection:
+        for (pair,) in connection.execute("SELECT pair_id FROM two_view_geometries").fetchall():
+            if 13 in (pair // MAX_NUM_IMAGES, pair % MAX_NUM_IMAGES):
+                connection.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair,))
+    result = map_database(lone, None, tmp_path / "out", OPTIONS, StageLog(), scene / "old" / "0")
+    row = result.solution.image_ids.tolist().index(13)
+    assert result.solution.image_verdicts[row] == "no_edges"
+    assert result.models[0].num_reg_images() == 24
+    assert result.solution.status == "partial"
+
+
+def test_rigs_are_extended_by_frames(tmp_path: Path) -> None:
+    truth = make_rigs(tmp_path / "all.db", num_frames=10)
+    last = tuple(sorted(truth.images)[-4:])
+    part = without_images(tmp_path / "all.db", tmp_path / "part.db", last)
+    view_graph_mapping(part, None, tmp_path / "old", OPTIONS)
+    models = view_graph_mapping(tmp_path / "all.db", None, tmp_path / "out", OPTIONS, input_path=tmp_path / "old" / "0")
+    assert models[0].num_reg_frames() == 10
+    before, after = poses(pycolmap.Reconstruction(tmp_path / "old" / "0")), poses(models[0])
+    for name, pose in before.items():
+        np.testing.assert_allclose(after[name], pose, atol=1e-9)
+    rows = [models[0].image(i).projection_center() for i in sorted(truth.images)]
+    distances, similarity = align_positions(
+        np.array(rows), np.array([truth.image(i).projection_center() for i in sorted(truth.images)])
+    )
+    assert distances.max() < 0.01
+    assert similarity.scale == pytest.approx(1.0, abs=0.01)
+
+
+def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
+    job = ["mapper", "--database_path", str(scene / "all.db"), "--output_path", str(tmp_path / "out")]
+    result = CliRunner().invoke(
+        app, [*job, "--input_path", str(scene / "old" / "0"), "--Mapper.fix_existing_images", "1"]
+    )
+    assert result.exit_code == 0, result.output
+    assert "25 of 25 images" in result.output
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "other"])
+def test_models_that_cannot_be_extended_are_told_at_once(scene: Path, tmp_path: Path, kind: str) -> None:
+    folder = tmp_path / "model"
+    told = {"missing": "no such folder", "empty": "is no COLMAP model", "other": "5 of its 25 images are not in the"}[
+        kind
+    ]
+    database = scene / "all.db"
+    if kind == "empty":
+        folder.mkdir()
+    if kind == "other":
+        folder, database = scene / "joint" / "0", scene / "part.db"
+    with pytest.raises(DataFileError, match=told):
+        view_graph_mapping(database, None, tmp_path / "out", OPTIONS, input_path=folder)
+    assert not (tmp_path / "out").exists()
