@@ -67,6 +67,9 @@ Switch = Any
 ReportSwitch = Annotated[
     Switch, _switch("--report", help="Write OUT/report.html: a page to look at the result, without a network.")
 ]
+RefIsGps = Annotated[
+    Switch, _switch("--ref_is_gps", help="Known positions are latitude, longitude and height (WGS84).")
+]
 InputPath = Annotated[
     Path | None,
     typer.Option("--input_path", help="Folder of a model of some of the images. The others are added to it."),

@@ -1,7 +1,7 @@
 """What the verbs do: the library's jobs, with their results shown and written to ``summary.json``."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pycolmap
@@ -17,6 +17,7 @@ from colmap_vg.jobs.mapper import MappingResult, map_database
 from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.jobs.summary import (
     edge_summary,
+    georeference_line,
     image_summary,
     job_summary,
     model_summary,
@@ -213,6 +214,31 @@ def explain(output_path: Path, image: str | None, pair: tuple[str, str] | None) 
     if pair is not None:
         return explain_pair(tables, *pair)
     return explain_job(tables, told_bridges(output_path)) if image is None else explain_image(tables, image)
+
+
+def align(
+    input_path: Path,
+    output_path: Path,
+    positions_path: Path | None,
+    points_path: Path | None,
+    by_gps: bool,
+    overwrite: bool,
+    reporter: Reporter,
+) -> None:
+    """A copy of a model in the frame of known positions."""
+    from colmap_vg.jobs.align import align
+
+    configure_colmap_log(reporter.verbose)
+    found = align(
+        input_path,
+        output_path,
+        positions_path=positions_path,
+        points_path=points_path,
+        by_gps=by_gps,
+        overwrite=overwrite,
+        log=StageLog(reporter.on_event),
+    )
+    reporter.say(f"{output_path / '0'}: {georeference_line(asdict(found))}")
 
 
 def report(output_path: Path, image_path: Path | None, database_path: Path | None, reporter: Reporter) -> None:

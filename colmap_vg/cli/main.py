@@ -151,6 +151,32 @@ def explain(
 
 
 @app.command()
+@takes_flags
+def align(
+    input_path: Annotated[Path, typer.Option("--input_path", help="Folder of a model. It is not changed.")],
+    output_path: flags.OutputPath,
+    ref_images_path: Annotated[
+        Path | None, typer.Option("--ref_images_path", help="Text file with a line NAME X Y Z for each known camera.")
+    ] = None,
+    ref_points_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--ref_points_path", help="Text file with a line POINT X Y Z IMAGE U V for each view of a survey point."
+        ),
+    ] = None,
+    ref_is_gps: flags.RefIsGps = "0",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace models in the output folder.")] = False,
+) -> None:
+    """Move a model into the frame of known camera positions or survey points: OUT/0."""
+    if (ref_images_path is None) == (ref_points_path is None):
+        raise typer.BadParameter("give either --ref_images_path or --ref_points_path")
+    with _job(False, False) as reporter:
+        import colmap_vg.cli.jobs as jobs
+
+        jobs.align(input_path, output_path, ref_images_path, ref_points_path, ref_is_gps, overwrite, reporter)
+
+
+@app.command()
 def report(
     output_path: Annotated[Path, typer.Option("--output_path", help="Folder of a finished job.")],
     image_path: Annotated[

@@ -110,13 +110,31 @@ def _in_metres(
     if chosen is cartesian or not chosen.any():
         out[chosen] = positions[chosen]
         return out, None, caveats
+    out[chosen], told = east_north_up(positions[chosen])
+    return out, told, caveats
+
+
+def east_north_up(positions: Array) -> tuple[Array, tuple[float, float, float]]:
+    """Convert GPS positions to metres about an origin among them.
+
+    Parameters
+    ----------
+    positions : (k, 3) array
+        Latitude and longitude in degrees, ellipsoidal height in metres (WGS84).
+
+    Returns
+    -------
+    positions : (k, 3) array
+        Metres east, north and up of the origin.
+    origin : (float, float, float)
+        Latitude, longitude and height.
+    """
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    on_ellipsoid = np.asarray(earth.ellipsoid_to_ecef(positions[chosen]))
+    on_ellipsoid = np.asarray(earth.ellipsoid_to_ecef(positions))
     origin = np.asarray(earth.ecef_to_ellipsoid(np.median(on_ellipsoid, axis=0)[None]))[0]
     # A round origin can be typed again: 1e-6 degrees are a tenth of a metre.
     told = (round(float(origin[0]), 6), round(float(origin[1]), 6), round(float(origin[2]), 1))
-    out[chosen] = earth.ellipsoid_to_enu(positions[chosen], *told)
-    return out, told, caveats
+    return np.asarray(earth.ellipsoid_to_enu(positions, *told)), told
 
 
 def _usable_covariances(covariances: Array) -> Array:

@@ -59,7 +59,7 @@ class Georeference:
 
 
 def georeference(
-    cache: "pycolmap.DatabaseCache",
+    cache: "pycolmap.DatabaseCache | None",
     model: "pycolmap.Reconstruction",
     priors: PosePriors,
     image_ids: IntArray,
@@ -70,7 +70,8 @@ def georeference(
 
     Parameters
     ----------
-    cache : pycolmap.DatabaseCache
+    cache : pycolmap.DatabaseCache or None
+        None: the model is moved only.
     model : pycolmap.Reconstruction
     priors : PosePriors
     image_ids : (n,) int64 array
@@ -92,13 +93,13 @@ def georeference(
     sigma = np.inf
     for _ in range(MAX_NUM_ROUNDS):
         found = align_robustly(_centers(model, image_ids[rows]), priors.positions[rows], _given(priors, rows), 0)
-        problem = _why_not(found)
+        problem = why_not(found)
         if problem:
             log.warn(f"The model is not georeferenced: {problem}. It has a scale and a frame of its own.")
             return None
-        _move(model, found.similarity)
+        move_model(model, found.similarity)
         before, sigma = sigma, float(np.sqrt(np.trace(found.covariances[found.right].mean(axis=0)) / 3.0))
-        if abs(before / sigma - 1.0) <= SAME_SIGMA:
+        if cache is None or abs(before / sigma - 1.0) <= SAME_SIGMA:
             break
         adjust_once_more(cache, model, options, priors=_pose_priors(found, priors.positions[rows], image_ids[rows]))
     if found.roll_is_free:
@@ -115,7 +116,7 @@ def _centers(model: "pycolmap.Reconstruction", image_ids: IntArray) -> Array:
     return np.array([model.image(image_id).projection_center() for image_id in image_ids.tolist()])
 
 
-def _why_not(found: AlignedPositions) -> str:
+def why_not(found: AlignedPositions) -> str:
     """Why an alignment is not to be used; empty if it is."""
     num, right = len(found.right), int(found.right.sum())
     if right < max(MIN_POSITIONS, MIN_SHARE_RIGHT * num):
@@ -127,7 +128,8 @@ def _why_not(found: AlignedPositions) -> str:
     return ""
 
 
-def _move(model: "pycolmap.Reconstruction", similarity: Similarity) -> None:
+def move_model(model: "pycolmap.Reconstruction", similarity: Similarity) -> None:
+    """Transform a model by a similarity, in place."""
     rotation = pycolmap.Rotation3d(similarity.rotation)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
 
@@ -165,7 +167,7 @@ def _level(model: "pycolmap.Reconstruction", priors: PosePriors, image_ids: IntA
         # Photographs are taken upright or looking down, so their lower sides or their views point down.
         cost = np.mean(right**2, axis=1) + 0.1 * np.mean(np.minimum(below, ahead), axis=1)
     turn = so3.exp(angles[[np.argmin(cost)]][:, None] * axis)[0]
-    _move(model, Similarity(1.0, turn, middle - turn @ middle))
+    move_model(model, Similarity(1.0, turn, middle - turn @ middle))
 
 
 def _told(
@@ -179,24 +181,37 @@ def _told(
     """Describe a georeferenced model, with warnings of wrong positions and of a level that is a guess."""
     names = [model.image(image_id).name for image_id in image_ids[rows].tolist()]
     residuals = priors.positions[rows] - _centers(model, image_ids[rows])
-    outliers = sorted(name for name, right in zip(names, found.right, strict=True) if not right)
-    if outliers:
-        log.warn(
-            f"{len(outliers)} of {len(names)} measured positions are wrong and not used (first: {outliers[0]}, off by"
-            f" {np.linalg.norm(residuals[names.index(outliers[0])]):.3g}); summary.json lists all."
-        )
     guessed = found.roll_is_free and not priors.has_gravity[rows].any()
+    told = described(names, residuals, found, priors.origin, guessed, log)
     if guessed:
         log.warn(
             "The cameras lie nearly on a line, and their measured positions are too uncertain to tell the rotation"
             " about it: it is chosen so that the photographs are level."
         )
+    return told
+
+
+def described(
+    names: list[str],
+    residuals: Array,
+    found: AlignedPositions,
+    origin: tuple[float, float, float] | None,
+    level_is_guessed: bool,
+    log: StageLog,
+) -> Georeference:
+    """Describe an alignment by the names and residuals (n, 3) of its positions, with a warning of wrong ones."""
+    outliers = sorted(name for name, right in zip(names, found.right, strict=True) if not right)
+    if outliers:
+        log.warn(
+            f"{len(outliers)} of {len(names)} measured positions are wrong and not used (first: {outliers[0]}, off by"
+            f" {np.linalg.norm(residuals[names.index(outliers[0])]):.3g}); the summary lists all."
+        )
     sigmas = np.sqrt(np.diagonal(found.covariances[found.right].mean(axis=0)))
     return Georeference(
-        frame="cartesian" if priors.origin is None else "ENU",
-        origin=priors.origin,
+        frame="cartesian" if origin is None else "ENU",
+        origin=origin,
         sigmas=(float(sigmas[0]), float(sigmas[1]), float(sigmas[2])),
         outliers=tuple(outliers),
         residuals={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(names, residuals, strict=True)},
-        level_is_guessed=guessed,
+        level_is_guessed=level_is_guessed,
     )
