@@ -81,8 +81,10 @@ def adjust_bundle(
             config.add_image(image_id)
     for sensor in held.sensors:
         config.set_constant_sensor_from_rig_pose(sensor)
-    if held.frames:
-        _hold_frames(reconstruction, config, held.frames)
+    # COLMAP moves no point that cameras outside of the adjustment see, too.
+    for frame_id in sorted(held.frames & set(reconstruction.reg_frame_ids())):
+        for data in reconstruction.frame(frame_id).image_ids:
+            config.set_constant_cam_intrinsics(reconstruction.image(data.id).camera_id)
     if priors:
         told, weighted = pycolmap.PosePriorBundleAdjustmentOptions(), _weighted(priors, reconstruction)
         adjuster = pycolmap.create_pose_prior_bundle_adjuster(bundle, told, config, weighted, reconstruction)
@@ -100,25 +102,26 @@ def adjust_bundle(
         before.restore(reconstruction)
         kept = replace(options, ba_refine_extra_params=False)
         return adjust_bundle(reconstruction, kept, trial=trial, priors=priors, held=held)
-    _move_short_tracks(reconstruction, scale)
+    _move_remaining_points(reconstruction, scale, held)
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
 
 
-def _hold_frames(
-    reconstruction: "pycolmap.Reconstruction", config: "pycolmap.BundleAdjustmentConfig", frames: frozenset[int]
-) -> None:
-    """Keep the cameras of frames; points that other images see move, with all their observations."""
-    seen: set[int] = set()
-    for image_id in sorted(reconstruction.reg_image_ids()):
-        image = reconstruction.image(image_id)
-        if image.frame_id in frames:
-            config.set_constant_cam_intrinsics(image.camera_id)
-        else:
-            seen.update(point.point3D_id for point in image.get_observation_points2D())
-    for point_id in sorted(seen):
-        config.add_variable_point(point_id)
+def _seen_by_held(reconstruction: "pycolmap.Reconstruction", held: Held) -> set[int]:
+    """Ids of points that held frames see in most of their observations, so that they stay where they are."""
+    if not held.frames:
+        return set()
+    images = {
+        data.id
+        for frame_id in held.frames & set(reconstruction.reg_frame_ids())
+        for data in reconstruction.frame(frame_id).image_ids
+    }
+    return {
+        point_id
+        for point_id, point in reconstruction.points3D.items()
+        if 2 * sum(element.image_id in images for element in point.track.elements) > point.track.length()
+    }
 
 
 def is_metric(reconstruction: "pycolmap.Reconstruction", sensors: Sequence["pycolmap.sensor_t"]) -> bool:
@@ -143,9 +146,17 @@ def _weighted(
     return copies
 
 
-def _move_short_tracks(reconstruction: "pycolmap.Reconstruction", scale_px: float) -> None:
-    """Refine the points whose tracks were too short to adjust the cameras, with the cameras fixed."""
-    short = [(i, p) for i, p in sorted(reconstruction.points3D.items()) if p.track.length() < MIN_TRACK_LENGTH]
+def _move_remaining_points(reconstruction: "pycolmap.Reconstruction", scale_px: float, held: Held) -> None:
+    """Refine points that did not move with the cameras, with these fixed.
+
+    Their tracks were too short, or cameras that are held see them, too; not those that are seen by these mostly.
+    """
+    settled = _seen_by_held(reconstruction, held)
+    short = [
+        (point_id, point)
+        for point_id, point in sorted(reconstruction.points3D.items())
+        if point_id not in settled and (held.frames or point.track.length() < MIN_TRACK_LENGTH)
+    ]
     if not short:
         return
     seen = Observations.of(reconstruction, [p for _, p in short])
