@@ -27,7 +27,8 @@ MIN_SHARE_RIGHT = 0.5
 MAX_NUM_ROUNDS, SAME_SIGMA = 4, 0.05
 """Maximum number of adjustments, and relative change of the positions' standard deviation at which they end. A bent
 model makes positions look worse than they are until it is straight."""
-NUM_ROLL_ANGLES = 3600
+NUM_ROLL_ANGLES, SAME_LEVEL = 3600, 0.05
+"""Number of rotations about a line that are compared, and difference of cost below which two ways are as level."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +164,18 @@ def _level(model: "pycolmap.Reconstruction", priors: PosePriors, image_ids: IntA
         down = np.einsum("kba,kb->ka", R[measured], gravities[measured])
         cost = np.median(heights @ down.T, axis=1)
     else:
-        right, below, ahead = (heights @ R[:, k].T for k in range(3))
-        # Photographs are taken upright or looking down, so their lower sides or their views point down.
-        cost = np.mean(right**2, axis=1) + 0.1 * np.mean(np.minimum(below, ahead), axis=1)
+        tilted, below, ahead = (heights @ R[:, k].T for k in range(3))
+        # Photographs are taken upright or looking down: their lower sides or their views point down.
+        ways = np.mean(tilted**2, axis=1) + 0.1 * np.stack([below.mean(axis=1), ahead.mean(axis=1)])
+        best = np.argmin(ways, axis=1)
+        cost = ways[np.argmin(ways.min(axis=1))]
+        if abs(ways[0, best[0]] - ways[1, best[1]]) <= SAME_LEVEL:
+            # Rows of pixels along the line are level in both: positions tell a right angle even where they are rough.
+            placed = priors.positions[[row_of[i] for i in inside]] - middle
+            turns = so3.exp(angles[best][:, None] * axis)
+            off = np.linalg.norm(placed - np.einsum("hab,kb->hka", turns, centers - middle), axis=2)
+            near = np.minimum(off, 3.0 * np.nanmedian(off))  # wrong positions tell nothing
+            cost = ways[np.argmin(np.nanmean(near**2, axis=1))]
     turn = so3.exp(angles[[np.argmin(cost)]][:, None] * axis)[0]
     move_model(model, Similarity(1.0, turn, middle - turn @ middle))
 

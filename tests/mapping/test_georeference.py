@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,12 @@ from typer.testing import CliRunner
 from colmap_vg import MappingOptions
 from colmap_vg.cli.main import app
 from colmap_vg.events import StageLog
+from colmap_vg.geometry import so3
+from colmap_vg.geometry.robust_similarity import align_robustly
 from colmap_vg.jobs.mapper import MappingResult, map_database
+from colmap_vg.mapping import bundle
+from colmap_vg.mapping.georeference import georeference, why_not
+from colmap_vg.scene.pose_priors import PosePriors
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.views import SyntheticViews, synthetic_views
 
@@ -154,3 +160,47 @@ def test_it_can_be_switched_off_and_is_told(plain: Path, flight: SyntheticViews,
     assert off.exit_code == 0, off.output
     assert "metres east" not in off.output
     assert json.loads((tmp_path / "off" / "summary.json").read_text())["models"][0]["georeference"] is None
+
+
+def test_a_minority_of_positions_is_no_reason_to_move_a_model() -> None:
+    aligned = align_robustly(np.eye(3), 10.0 * np.eye(3))
+    few = replace(aligned, right=np.array([True] * 3 + [False] * 4))
+    assert why_not(aligned) == ""
+    assert why_not(few) == "only 3 of 7 measured positions agree with it"
+
+
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""cam_from_world rotation of a camera that looks north, with its lower side down."""
+LOOKING_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+"""cam_from_world rotation of a camera that looks down, with its upper side north."""
+
+
+@pytest.mark.parametrize("with_gravity", [False, True])
+@pytest.mark.parametrize("true", [UPRIGHT, LOOKING_DOWN], ids=["upright", "looking down"])
+def test_the_rotation_about_a_line_is_set_by_gravity_or_level_photographs(true: np.ndarray, with_gravity: bool) -> None:
+    """Along a street or a flight with a little sway, measured more roughly than it sways."""
+    rng = np.random.default_rng(0)
+    sway = np.column_stack([10.0 * np.arange(30), rng.normal(size=(30, 2))])
+    model, roll = pycolmap.Reconstruction(), so3.exp(np.array([[1.1, 0.0, 0.0]]))[0]
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", params=[1.0, 0.5, 0.5]))
+    for row, center in enumerate(sway @ roll):
+        R = true @ roll
+        image = pycolmap.Image(name=f"{row}.jpg", camera_id=1, image_id=row + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center))
+    gravities = np.tile(true @ [0.0, 0.0, -1.0] if with_gravity else [np.nan] * 3, (30, 1))
+    priors = PosePriors(sway + 2.0 * rng.normal(size=(30, 3)), np.full((30, 3, 3), np.nan), gravities)
+    told = georeference(None, model, priors, np.arange(1, 31), MappingOptions(), StageLog())
+    assert told is not None
+    assert told.level_is_guessed == (not with_gravity)
+    for image in model.images.values():
+        turned = image.cam_from_world().rotation.matrix()
+        assert np.degrees(np.arccos((turned * true).sum(axis=1))).max() < 3.0
+
+
+def test_positions_weigh_relative_to_the_keypoints() -> None:
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=8, num_points3D=200)
+    model = pycolmap.synthesize_dataset(options)
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=2.0), model)
+    (weighted,) = bundle._weighted([prior(1, np.zeros(3), sigma=3.0)], model)
+    np.testing.assert_allclose(weighted.position_covariance, 9.0 / 4.0 * np.eye(3), rtol=0.25)

@@ -120,6 +120,16 @@ def test_what_does_not_agree_or_is_not_known_is_not_linked() -> None:
         np.testing.assert_array_equal(P, before[1])
 
 
+def test_frames_of_which_most_disagree_link_nothing() -> None:
+    scene = Scene(known=True)
+    other = scene.rigs.sensor_idx == 2
+    R, P = moved(scene, other)
+    wrong = other & (scene.rigs.frame_idx >= 5)  # five of twelve frames agree
+    R[wrong], P[wrong] = so3.random(int(wrong.sum()), np.random.default_rng(0)), 0.0
+    component = link_components(scene.rigs, R, P, other.astype(np.int64))
+    np.testing.assert_array_equal(component, other.astype(np.int64))
+
+
 def test_two_common_frames_are_too_few() -> None:
     scene = Scene(known=True)
     other = scene.rigs.sensor_idx == 2
