@@ -15,8 +15,10 @@ _HOME = {
     "FeatureOptions": "options",
     "ImageVerdict": "scene.verdicts",
     "MappingOptions": "options",
+    "PosePriors": "scene.pose_priors",
     "PoseSolution": "scene.solution",
     "ReadOptions": "options",
+    "Rigs": "scene.rigs",
     "Similarity": "geometry.similarity",
     "SolutionStatus": "scene.verdicts",
     "SolveOptions": "options",
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
     from colmap_vg.jobs.mapper import view_graph_mapping
     from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
     from colmap_vg.reading.read import read_view_graph
+    from colmap_vg.scene.pose_priors import PosePriors
+    from colmap_vg.scene.rigs import Rigs
     from colmap_vg.scene.solution import PoseSolution
     from colmap_vg.scene.verdicts import EdgeVerdict, ImageVerdict, SolutionStatus
     from colmap_vg.scene.view_graph import ViewGraph
@@ -50,8 +54,10 @@ __all__ = [
     "FeatureOptions",
     "ImageVerdict",
     "MappingOptions",
+    "PosePriors",
     "PoseSolution",
     "ReadOptions",
+    "Rigs",
     "Similarity",
     "SolutionStatus",
     "SolveOptions",

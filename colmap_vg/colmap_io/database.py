@@ -18,6 +18,8 @@ from urllib.parse import quote
 from colmap_vg.errors import DatabaseError
 
 REQUIRED_TABLES = ("cameras", "images", "keypoints", "two_view_geometries")
+CAMERA_SENSOR = 0
+"""COLMAP's type of sensors that are cameras, as stored in frames, rigs and pose priors."""
 PATIENCE = 5.0
 """Seconds to wait for another process that is writing to a database."""
 _SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -78,18 +80,6 @@ def check_database(database_path: str | PathLike[str]) -> None:
                 f"{database_path}: contains {num_images} images but no verified pairs; match them first"
                 " (colmap exhaustive_matcher), or verify the matches (colmap geometric_verifier)"
             )
-
-
-def image_names(database_path: str | PathLike[str]) -> set[str]:
-    """Names of all images of a checked database.
-
-    Raises
-    ------
-    DatabaseError
-        As for :func:`reading`.
-    """
-    with reading(database_path) as connection:
-        return {str(name) for (name,) in connection.execute("SELECT name FROM images")}
 
 
 def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.database import reading
+from colmap_vg.colmap_io.database import CAMERA_SENSOR, reading
 from colmap_vg.errors import DatabaseError
 from colmap_vg.scene.pose_priors import PosePriors
 
@@ -16,8 +16,6 @@ Array = NDArray[np.float64]
 
 WGS84, CARTESIAN = 0, 1
 """COLMAP's coordinate systems of positions, as stored in a database."""
-CAMERA_SENSOR = 0
-"""COLMAP's type of sensors that are cameras."""
 MAX_POSITION = 1e9
 """Maximum absolute Cartesian coordinate; larger ones are damage."""
 _COLUMNS = ("position", "position_covariance", "gravity", "coordinate_system")
@@ -28,8 +26,8 @@ def read_pose_priors(
 ) -> tuple[PosePriors | None, tuple[str, ...]]:
     """Read the pose priors of a database, of the current or an older schema.
 
-    GPS positions become metres east, north and up of their median. Gravity along an axis of the camera is not taken:
-    COLMAP derives it from the orientation of the photograph, which is no measurement.
+    GPS positions become metres east, north and up of an origin among them. Gravity along an axis of the camera is not
+    taken: COLMAP derives it from the orientation of the photograph, which is no measurement.
 
     Parameters
     ----------

@@ -7,16 +7,13 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.database import reading
+from colmap_vg.colmap_io.database import CAMERA_SENSOR, reading
 from colmap_vg.errors import DatabaseError
 from colmap_vg.geometry import so3
 from colmap_vg.scene.rigs import Rigs
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-CAMERA_SENSOR = 0
-"""COLMAP's type of sensors that are cameras."""
 
 
 def read_rigs(database_path: str | PathLike[str], image_ids: IntArray) -> Rigs | None:
@@ -41,12 +38,13 @@ def read_rigs(database_path: str | PathLike[str], image_ids: IntArray) -> Rigs |
         if not _has_rigs(connection):
             return None
         sensors = connection.execute(
-            "SELECT rig_id, ref_sensor_id, 1, NULL FROM rigs WHERE ref_sensor_type = 0 UNION ALL"
-            " SELECT rig_id, sensor_id, 0, sensor_from_rig FROM rig_sensors WHERE sensor_type = 0 ORDER BY 1, 3 DESC, 2"
+            f"SELECT rig_id, ref_sensor_id, 1, NULL FROM rigs WHERE ref_sensor_type = {CAMERA_SENSOR} UNION ALL"
+            " SELECT rig_id, sensor_id, 0, sensor_from_rig FROM rig_sensors"
+            f" WHERE sensor_type = {CAMERA_SENSOR} ORDER BY 1, 3 DESC, 2"
         ).fetchall()
         frames = connection.execute("SELECT frame_id, rig_id FROM frames ORDER BY frame_id").fetchall()
         images = connection.execute(
-            "SELECT data_id, frame_id, sensor_id FROM frame_data WHERE sensor_type = 0 ORDER BY data_id"
+            f"SELECT data_id, frame_id, sensor_id FROM frame_data WHERE sensor_type = {CAMERA_SENSOR} ORDER BY data_id"
         ).fetchall()
     rig_of_frame = dict(frames)
     row_of_frame = {frame: row for row, (frame, _) in enumerate(frames)}
@@ -97,17 +95,18 @@ def store_separated(database_path: str | PathLike[str], image_ids: IntArray, rig
     rig_of_frame = rigs.rig_ids[rigs.sensor_idx[alone]].tolist()
     with closing(sqlite3.connect(database_path)) as connection, connection:
         connection.executemany(
-            "DELETE FROM rig_sensors WHERE sensor_type = 0 AND sensor_id = ?", [(camera,) for camera in cameras]
+            f"DELETE FROM rig_sensors WHERE sensor_type = {CAMERA_SENSOR} AND sensor_id = ?",
+            [(camera,) for camera in cameras],
         )
         connection.executemany(
-            "INSERT INTO rigs (rig_id, ref_sensor_id, ref_sensor_type) VALUES (?, ?, 0)",
+            f"INSERT INTO rigs (rig_id, ref_sensor_id, ref_sensor_type) VALUES (?, ?, {CAMERA_SENSOR})",
             list(zip(rigs.rig_ids[sensors].tolist(), cameras, strict=True)),
         )
         connection.executemany(
             "INSERT INTO frames (frame_id, rig_id) VALUES (?, ?)", list(zip(frames, rig_of_frame, strict=True))
         )
         connection.executemany(
-            "UPDATE frame_data SET frame_id = ? WHERE sensor_type = 0 AND data_id = ?",
+            f"UPDATE frame_data SET frame_id = ? WHERE sensor_type = {CAMERA_SENSOR} AND data_id = ?",
             list(zip(frames, image_ids[alone].tolist(), strict=True)),
         )
         connection.execute("DELETE FROM frames WHERE frame_id NOT IN (SELECT frame_id FROM frame_data)")
@@ -118,7 +117,7 @@ def _has_rigs(connection: sqlite3.Connection) -> bool:
     (tables,) = connection.execute("SELECT COUNT(*) FROM sqlite_master WHERE name = 'rig_sensors'").fetchone()
     if tables == 0:  # an older schema
         return False
-    (sensors,) = connection.execute("SELECT COUNT(*) FROM rig_sensors WHERE sensor_type = 0").fetchone()
+    (sensors,) = connection.execute(f"SELECT COUNT(*) FROM rig_sensors WHERE sensor_type = {CAMERA_SENSOR}").fetchone()
     return bool(sensors > 0)
 
 

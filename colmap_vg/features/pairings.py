@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from colmap_vg.colmap_io.pose_priors import read_pose_priors
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.events import StageLog
 from colmap_vg.features.orientation_votes import excess_over_chance
@@ -152,18 +153,11 @@ def spatial_pairs(database_path: str | PathLike[str], log: StageLog) -> tuple[Na
 
 
 def _gps_positions(database_path: str | PathLike[str]) -> dict[str, NDArray[np.float64]]:
-    """GPS positions (3,) of the images that have one, metres."""
+    """Positions (3,) of the images that have one, metres; those by GPS without their heights, which are poor."""
     with pycolmap.Database.open(database_path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        priors = {prior.corr_data_id.id: prior for prior in database.read_all_pose_priors()}
-    located = [prior for image_id, prior in priors.items() if image_id in names and _is_position(prior.position)]
-    positions = np.array([prior.position for prior in located]).reshape(-1, 3)
-    if len(located) and all(p.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84 for p in located):
-        positions[:, 2] = 0.0  # heights by GPS are poor
-        positions = np.asarray(pycolmap.GPSTransform().ellipsoid_to_ecef(positions))
-    return {names[prior.corr_data_id.id]: at for prior, at in zip(located, positions, strict=True)}
-
-
-def _is_position(position: NDArray[np.float64]) -> bool:
-    """Whether a GPS position is valid; receivers without a fix write zeros."""
-    return bool(np.all(np.isfinite(position)) and np.any(position[:2] != 0.0))
+    priors, _ = read_pose_priors(database_path, list(names))
+    if priors is None:
+        return {}
+    positions = priors.positions if priors.origin is None else priors.positions * np.array([1.0, 1.0, 0.0])
+    return {name: at for name, at in zip(names.values(), positions, strict=True) if np.isfinite(at).all()}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_vg.colmap_io.database import check_database, image_names
+from colmap_vg.colmap_io.database import check_database
 from colmap_vg.colmap_io.quiet import quiet_colmap
 from colmap_vg.colmap_io.reconstruction import loaded_cache, write_model
 from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cameras
@@ -146,9 +146,9 @@ def map_database(
     """
     check_database(database_path)
     refuse_models(output_path, options.overwrite)
-    given = None if input_path is None else read_input_model(input_path, image_names(database_path))
     with work_folder(output_path, options.overwrite) as work:
         graph = _read(database_path, options, log)
+        given = None if input_path is None else read_input_model(input_path, set(graph.image_names))
         if given is None:
             solution, built = _solved_models(database_path, work, graph, options, log)
         else:

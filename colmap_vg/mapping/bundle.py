@@ -38,9 +38,9 @@ class Held:
 NOTHING_HELD = Held()
 
 
-def held_of(cache: "pycolmap.DatabaseCache", frames: frozenset[int] = frozenset()) -> Held:
-    """Hold the sensors whose place in their rig the database knows, and some frames."""
-    rigs = [rig for _, rig in sorted(cache.rigs.items())]
+def held_of(of: "pycolmap.DatabaseCache | pycolmap.Reconstruction", frames: frozenset[int] = frozenset()) -> Held:
+    """Hold the sensors whose place in their rig a database or a model knows, and some frames."""
+    rigs = [rig for _, rig in sorted(of.rigs.items())]
     sensors = [sensor for rig in rigs for sensor in rig.non_ref_sensors if rig.has_sensor_from_rig(sensor)]
     return Held(sensors, frames)
 
@@ -86,15 +86,13 @@ def adjust_bundle(
         for data in reconstruction.frame(frame_id).image_ids:
             config.set_constant_cam_intrinsics(reconstruction.image(data.id).camera_id)
     if priors:
-        told, weighted = pycolmap.PosePriorBundleAdjustmentOptions(), _weighted(priors, reconstruction)
-        adjuster = pycolmap.create_pose_prior_bundle_adjuster(bundle, told, config, weighted, reconstruction)
-    elif held.frames:
-        adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
-    elif is_metric(reconstruction, held.sensors):
-        config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
-        adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
+        of_priors, weighted = pycolmap.PosePriorBundleAdjustmentOptions(), _weighted(priors, reconstruction)
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(bundle, of_priors, config, weighted, reconstruction)
     else:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        if not held.frames and is_metric(reconstruction, held.sensors):
+            config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
+        elif not held.frames:
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction)
     before = Snapshot.of(reconstruction) if options.ba_refine_extra_params else None
     summary = adjuster.solve()

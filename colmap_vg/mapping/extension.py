@@ -96,7 +96,8 @@ def extend_model(
     if copied == 0:
         triangulate_registered(mapper, options, log)
     frames = {model.image(image_id).frame_id for image_id in old.values()}
-    held = held_of(cache, frozenset(frames) if options.fix_existing_frames else frozenset())
+    # Images of given frames would move with the places of their sensors.
+    held = held_of(model, frozenset(frames)) if options.fix_existing_frames else held_of(cache)
     result = finish_registration(mapper, options, log, pairs, held, frozenset(frames))
     mapper.end_reconstruction(False)
     if not options.fix_existing_frames:

@@ -83,7 +83,7 @@ def georeference(
     Returns
     -------
     Georeference or None
-        None where too few positions agree with the model; a warning says so, and the model stays as it is.
+        None where too few positions agree with the model, or they are too uncertain; a warning says so.
     """
     inside = np.isin(image_ids, np.array(sorted(model.reg_image_ids()), dtype=np.int64))
     rows = np.flatnonzero(priors.has_position & inside)

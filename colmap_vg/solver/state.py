@@ -180,7 +180,12 @@ class SolverState:
         for grown in np.unique(self._component[self._component != before]):
             inside = self._component == grown
             moved = self._p[inside] - self._p[inside].mean(axis=0)
-            self._p[inside] = moved / np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+            unit = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+            self._p[inside] = moved / unit
+            if self._covariances is not None:
+                # Those of the linked images lack the link's own uncertainty.
+                self._covariances[0, inside & (before != grown)] = np.nan
+                self._covariances[0, inside & (before == grown)] /= unit**2
             self.caveats.append(
                 f"{int((inside & (before != grown)).sum())} images are linked to the others by their rig alone: no pair"
                 " confirms their place."

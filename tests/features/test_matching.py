@@ -162,6 +162,7 @@ def test_shortlists_get_positions_and_are_extended_by_shared_partners(
     with pycolmap.Database.open(tmp_path / "a.db") as database:
         image = database.read_all_images()[0]
         prior = pycolmap.PosePrior(position=np.array([4.0, 5.0, 6.0]))
+        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
         prior.corr_data_id, prior.pose_prior_id = image.data_id, 1
         database.write_pose_prior(prior)
     chain, seen, tried = np.abs(np.subtract.outer(np.arange(4), np.arange(4))) == 1, [], []
