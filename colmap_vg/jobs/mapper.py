@@ -24,7 +24,7 @@ from colmap_vg.mapping.build import (
     build_model,
 )
 from colmap_vg.mapping.colors import extract_colors
-from colmap_vg.mapping.extension import extend_model, read_input_model
+from colmap_vg.mapping.extension import check_image_names, extend_model, read_input_model
 from colmap_vg.mapping.georeference import Georeference, georeference
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.posed_model import posed_model, scale_is_uncertain, with_placed_sensors
@@ -147,8 +147,8 @@ def map_database(
     check_database(database_path)
     refuse_models(output_path, options.overwrite)
     with work_folder(output_path, options.overwrite) as work:
-        graph = _read(database_path, options, log)
-        given = None if input_path is None else read_input_model(input_path, set(graph.image_names))
+        given = None if input_path is None else read_input_model(input_path)
+        graph = _read(database_path, options, log, given)
         if given is None:
             solution, built = _solved_models(database_path, work, graph, options, log)
         else:
@@ -345,7 +345,12 @@ def _pair_rotations(graph: ViewGraph) -> PairRotations:
     return PairRotations(graph.image_ids[graph.edges[posed]], graph.cam2_from_cam1_rotations[posed], matches[posed])
 
 
-def _read(database_path: str | PathLike[str], options: MappingOptions, log: StageLog) -> ViewGraph:
+def _read(
+    database_path: str | PathLike[str],
+    options: MappingOptions,
+    log: StageLog,
+    given: "pycolmap.Reconstruction | None" = None,
+) -> ViewGraph:
     with log.stage("view graph"):
         read = replace(options.read, random_seed=options.random_seed)
         if not options.ba_refine_focal_length:
@@ -353,7 +358,9 @@ def _read(database_path: str | PathLike[str], options: MappingOptions, log: Stag
             read = replace(read, trust_focal_lengths="always")
         if not options.ba_refine_extra_params:
             read = replace(read, find_distortion=False)
-        graph, caveats = read_with_caveats(database_path, read)
+        graph, caveats = read_with_caveats(database_path, read, given)
+        if given is not None:
+            check_image_names(given, graph.image_names)
         for caveat in caveats:
             log.warn(caveat)
         log.result(f"{graph.num_images} images, {graph.num_edges} pairs, {int(graph.has_rotation.sum())} usable")

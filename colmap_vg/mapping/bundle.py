@@ -4,6 +4,7 @@ Only tracks of three views or more adjust the cameras, since tracks of two views
 Points of two views are refined afterwards with the cameras fixed.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -106,19 +107,15 @@ def adjust_bundle(
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
 
 
-def _seen_by_held(reconstruction: "pycolmap.Reconstruction", held: Held) -> set[int]:
-    """Ids of points that held frames see in most of their observations, so that they stay where they are."""
-    if not held.frames:
-        return set()
-    images = {
-        data.id
-        for frame_id in held.frames & set(reconstruction.reg_frame_ids())
-        for data in reconstruction.frame(frame_id).image_ids
-    }
+def _seen_by_others(reconstruction: "pycolmap.Reconstruction", held: Held) -> set[int]:
+    """Ids of points that frames which are not held see in half of their observations or more."""
+    seen: Counter[int] = Counter()
+    for image_id in reconstruction.reg_image_ids():
+        image = reconstruction.image(image_id)
+        if image.frame_id not in held.frames:
+            seen.update(point.point3D_id for point in image.get_observation_points2D())
     return {
-        point_id
-        for point_id, point in reconstruction.points3D.items()
-        if 2 * sum(element.image_id in images for element in point.track.elements) > point.track.length()
+        point_id for point_id, count in seen.items() if 2 * count >= reconstruction.point3D(point_id).track.length()
     }
 
 
@@ -149,12 +146,12 @@ def _move_remaining_points(reconstruction: "pycolmap.Reconstruction", scale_px: 
 
     Their tracks were too short, or cameras that are held see them, too; not those that are seen by these mostly.
     """
-    settled = _seen_by_held(reconstruction, held)
-    short = [
-        (point_id, point)
-        for point_id, point in sorted(reconstruction.points3D.items())
-        if point_id not in settled and (held.frames or point.track.length() < MIN_TRACK_LENGTH)
-    ]
+    points = sorted(reconstruction.points3D.items())
+    if held.frames:
+        moving = _seen_by_others(reconstruction, held)
+        short = [(point_id, point) for point_id, point in points if point_id in moving]
+    else:
+        short = [(point_id, point) for point_id, point in points if point.track.length() < MIN_TRACK_LENGTH]
     if not short:
         return
     seen = Observations.of(reconstruction, [p for _, p in short])

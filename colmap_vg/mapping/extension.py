@@ -1,5 +1,6 @@
 """Extend an existing model by the other images of a database, with its cameras fixed or adjusted too."""
 
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 
@@ -22,20 +23,18 @@ NUM_COMPARED, SAME_KEYPOINT_PX = 20, 0.01
 """Number of keypoints of each image that are compared, and maximum distance between those that are the same, pixels."""
 
 
-def read_input_model(input_path: str | PathLike[str], image_names: set[str]) -> "pycolmap.Reconstruction":
+def read_input_model(input_path: str | PathLike[str]) -> "pycolmap.Reconstruction":
     """Read a model to start from.
 
     Parameters
     ----------
     input_path : path
         Folder of a COLMAP model, binary or text.
-    image_names : set of str
-        Names of the database's images.
 
     Raises
     ------
     DataFileError
-        The model cannot be read, has fewer than two registered images, or images that the database lacks.
+        The model cannot be read, or has fewer than two registered images.
     """
     if not Path(input_path).is_dir():
         raise DataFileError(f"{input_path}: no such folder; input_path is the folder of a COLMAP model")
@@ -43,16 +42,28 @@ def read_input_model(input_path: str | PathLike[str], image_names: set[str]) -> 
         model = pycolmap.Reconstruction(input_path)
     except (ValueError, RuntimeError, OSError, IndexError) as error:
         raise DataFileError(f"{input_path}: is no COLMAP model that can be read ({error})") from error
-    names = {model.image(image_id).name for image_id in model.reg_image_ids()}
-    if len(names) < 2:
-        raise DataFileError(f"{input_path}: has {len(names)} registered images; a model to start from needs two")
-    lacking = sorted(names - image_names)
-    if lacking:
+    if model.num_reg_images() < 2:
         raise DataFileError(
-            f"{input_path}: {len(lacking)} of its {len(names)} images are not in the database (first: {lacking[0]});"
-            " match all images in one database, under the names that they have in the model"
+            f"{input_path}: has {model.num_reg_images()} registered images; a model to start from needs two"
         )
     return model
+
+
+def check_image_names(model: "pycolmap.Reconstruction", image_names: Iterable[str]) -> None:
+    """Check that a database has all registered images of a model to start from.
+
+    Raises
+    ------
+    DataFileError
+        It lacks some.
+    """
+    names = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    lacking = sorted(names.difference(image_names))
+    if lacking:
+        raise DataFileError(
+            f"{len(lacking)} of the {len(names)} images of the model to start from are not in the database (first:"
+            f" {lacking[0]}); match all images in one database, under the names that they have in the model"
+        )
 
 
 def extend_model(
@@ -151,12 +162,18 @@ def _copy_points(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstructi
             far = own.point2D(place).xy - theirs.point2D(place).xy
             if np.abs(far).max() > SAME_KEYPOINT_PX:
                 return 0
+    same_ids = all(image_id == new_id for image_id, new_id in old.items())
     for _, point in sorted(given.points3D.items()):
-        track = pycolmap.Track()
-        for element in point.track.elements:
-            track.add_element(old[element.image_id], element.point2D_idx)
+        track = point.track if same_ids else _renumbered(point.track, old)
         model.add_point3D(np.asarray(point.xyz), track, np.asarray(point.color))
     return int(given.num_points3D())
+
+
+def _renumbered(track: "pycolmap.Track", old: dict[int, int]) -> "pycolmap.Track":
+    renumbered = pycolmap.Track()
+    for element in track.elements:
+        renumbered.add_element(old[element.image_id], element.point2D_idx)
+    return renumbered
 
 
 def _align(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", old: dict[int, int]) -> None:

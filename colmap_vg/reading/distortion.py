@@ -38,13 +38,17 @@ FOLD = 0.98
 """Share of the largest distorted radius for a negative kappa, beyond which pixels cannot be undistorted."""
 
 
-def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[str]) -> tuple[DatabaseTables, Array]:
+def with_found_distortion(
+    tables: DatabaseTables, database_path: str | PathLike[str], calibrated: BoolArray | None = None
+) -> tuple[DatabaseTables, Array]:
     """Add a radial term to cameras without distortion, where the matches support one.
 
     Parameters
     ----------
     tables : DatabaseTables
     database_path : path
+    calibrated : (c,) bool array, optional
+        Cameras whose lens is known to have no more distortion than stated.
 
     Returns
     -------
@@ -56,7 +60,7 @@ def with_found_distortion(tables: DatabaseTables, database_path: str | PathLike[
     terms = np.zeros(len(tables.cameras))
     kinds: dict[object, list[int]] = {}
     for row, camera in enumerate(tables.cameras):
-        if has_radial_term(camera) and is_undistorted(camera):
+        if has_radial_term(camera) and is_undistorted(camera) and (calibrated is None or not calibrated[row]):
             kinds.setdefault((camera.model_name, camera.width, camera.height), []).append(row)
     caveats = []
     for rows in kinds.values():

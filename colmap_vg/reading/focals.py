@@ -58,14 +58,31 @@ class FocalDecision:
     caveats: tuple[str, ...]
 
 
-def decide_focal_lengths(tables: DatabaseTables, options: ReadOptions) -> FocalDecision:
-    """Decide for each camera whether its focal length is kept, and by what factor it is changed otherwise."""
+def decide_focal_lengths(
+    tables: DatabaseTables, options: ReadOptions, calibrated: BoolArray | None = None
+) -> FocalDecision:
+    """Decide for each camera whether its focal length is kept, and by what factor it is changed otherwise.
+
+    Parameters
+    ----------
+    tables : DatabaseTables
+    options : ReadOptions
+    calibrated : (c,) bool array, optional
+        Cameras that keep their focal length in any case, as those of a given model.
+
+    Returns
+    -------
+    FocalDecision
+    """
+    calibrated = np.zeros(len(tables.cameras), dtype=bool) if calibrated is None else calibrated
+    if calibrated.all():
+        return FocalDecision(np.ones(len(calibrated)), np.ones(len(calibrated), dtype=bool), ())
     # Spherical cameras have no focal length that could be wrong.
     prior = np.array([c.has_prior_focal_length or c.is_spherical() for c in tables.cameras], dtype=bool)
     as_given = np.ones(len(prior))
     if options.trust_focal_lengths == "always":
         return FocalDecision(as_given, np.ones(len(prior), dtype=bool), _contradictions(tables, options))
-    return _voted(tables, prior, options)
+    return _voted(tables, prior, calibrated, options)
 
 
 def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, ...]:
@@ -87,22 +104,23 @@ def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, 
     )
 
 
-def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> FocalDecision:
+def _voted(tables: DatabaseTables, prior: BoolArray, calibrated: BoolArray, options: ReadOptions) -> FocalDecision:
     focals = _focal_lengths(tables)
     spherical = np.array([c.is_spherical() for c in tables.cameras], dtype=bool)
-    given = (prior & (options.trust_focal_lengths != "never")) | spherical
+    given = (prior & (options.trust_focal_lengths != "never")) | spherical | calibrated
     calibration = _self_calibration(tables, focals, given, options)
     if calibration is None:
         unchecked = () if spherical.all() else (_why_unchecked(tables, options),)
         return FocalDecision(np.ones(len(focals)), prior, unchecked)
-    found = calibration.focal_lengths
+    changed = calibration.found & ~calibrated
+    found = np.where(calibrated, focals, calibration.focal_lengths)
     without = ~given & ~calibration.decided
     found = np.where(given, found, _in_common(tables, found, calibration, given))
     scales = found / focals
     caveats = [
         f"Camera {c.camera_id}: the focal length {f:.1f} px of the database is contradicted by its image pairs;"
         f" {s * f:.1f} px is used instead."
-        for c, f, s, bad in zip(tables.cameras, focals, scales, calibration.found & prior, strict=True)
+        for c, f, s, bad in zip(tables.cameras, focals, scales, changed & prior, strict=True)
         if bad
     ]
     if without.any():
@@ -111,7 +129,7 @@ def _voted(tables: DatabaseTables, prior: BoolArray, options: ReadOptions) -> Fo
             f"{int(without.sum())} of {len(focals)} cameras have no focal length, and their pairs do not determine it;"
             f" {source}."
         )
-    return FocalDecision(np.asarray(scales, dtype=float), given & ~calibration.found, tuple(caveats))
+    return FocalDecision(np.asarray(scales, dtype=float), given & ~changed, tuple(caveats))
 
 
 def _why_unchecked(tables: DatabaseTables, options: ReadOptions) -> str:

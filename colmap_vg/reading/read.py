@@ -16,6 +16,7 @@ from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
 from colmap_vg.reading.distortion import with_found_distortion
 from colmap_vg.reading.focals import FocalDecision, decide_focal_lengths
+from colmap_vg.reading.given_model import explained_pairs, of_pairs, with_given_cameras, with_pairs_of_model
 from colmap_vg.reading.relative_poses import relative_poses
 from colmap_vg.reading.still_background import without_still_background
 from colmap_vg.reading.verification import with_verified_geometries
@@ -55,21 +56,39 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
 
 
 @single_threaded_blas
-def read_with_caveats(database_path: str | PathLike[str], options: ReadOptions) -> tuple[ViewGraph, tuple[str, ...]]:
-    """Read the viewing graph, and sentences on what was changed or could not be decided on reading."""
+def read_with_caveats(
+    database_path: str | PathLike[str], options: ReadOptions, model: "pycolmap.Reconstruction | None" = None
+) -> tuple[ViewGraph, tuple[str, ...]]:
+    """Read the viewing graph, and sentences on what was changed or could not be decided on reading.
+
+    With a `model` of some of the images, its calibrations are used, and pairs that it explains get its relative poses.
+    """
     tables = read_tables(database_path)
+    if model is None:
+        graph, caveats = _read(tables, database_path, options, np.zeros(len(tables.cameras), dtype=bool))
+    else:
+        tables, given = with_given_cameras(tables, model)
+        explained = explained_pairs(tables, given, options)
+        graph, caveats = _read(of_pairs(tables, ~explained), database_path, options, given.calibrated)
+        graph = with_pairs_of_model(graph, tables, explained, given)
+    priors, ignored = read_pose_priors(database_path, tables.image_ids.tolist())
+    rigs = read_rigs(database_path, tables.image_ids)
+    return replace(graph, priors=priors, rigs=rigs), (*caveats, *ignored)
+
+
+def _read(
+    tables: DatabaseTables, database_path: str | PathLike[str], options: ReadOptions, calibrated: BoolArray
+) -> tuple[ViewGraph, tuple[str, ...]]:
+    """Graph of the pairs of the tables; marked cameras (c,) keep their calibration."""
     terms = np.zeros(len(tables.cameras))
     if options.find_distortion:
-        tables, terms = with_found_distortion(tables, database_path)
+        tables, terms = with_found_distortion(tables, database_path, calibrated)
     tables, thinned = without_still_background(tables, database_path)
     expected = thinned | (terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1)
     tables, changed = with_verified_geometries(tables, options.random_seed, expected)
     changed |= thinned
-    focals = decide_focal_lengths(tables, options)
-    priors, ignored = read_pose_priors(database_path, tables.image_ids.tolist())
-    rigs = read_rigs(database_path, tables.image_ids)
-    graph = replace(_graph(tables, focals, changed, terms, options), priors=priors, rigs=rigs)
-    return graph, (*tables.caveats, *focals.caveats, *ignored)
+    focals = decide_focal_lengths(tables, options, calibrated)
+    return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
 
 
 def _graph(

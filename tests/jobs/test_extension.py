@@ -157,9 +157,11 @@ def test_from_the_command_line(scene: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["missing", "empty", "other"])
 def test_models_that_cannot_be_extended_are_told_at_once(scene: Path, tmp_path: Path, kind: str) -> None:
     folder = tmp_path / "model"
-    told = {"missing": "no such folder", "empty": "is no COLMAP model", "other": "5 of its 25 images are not in the"}[
-        kind
-    ]
+    told = {
+        "missing": "no such folder",
+        "empty": "is no COLMAP model",
+        "other": "5 of the 25 images of the model",
+    }[kind]
     database = scene / "all.db"
     if kind == "empty":
         folder.mkdir()
