@@ -154,6 +154,10 @@ class MappingOptions(_Checked):
     extract_colors: bool = True
     fix_existing_frames: bool = True  # keep poses and calibrations of a model to start from (input_path) as they are
     use_prior_position: bool = True  # georeference models by the measured positions in the database
+    overwrite_priors_covariance: bool = False  # use the standard deviations below instead of the database's covariances
+    prior_position_std_x: float = _number(1.0, 1e-9)  # metres east, or the unit of Cartesian positions
+    prior_position_std_y: float = _number(1.0, 1e-9)  # metres north
+    prior_position_std_z: float = _number(1.0, 1e-9)  # metres up
     overwrite: bool = False
     num_threads: int = _number(-1, -1)  # -1: all cores
     random_seed: int = _number(0, 0)  # of all stages; replaces those of read and solve

@@ -25,6 +25,10 @@ REFINE_EXTRA_PARAMS = (
 )
 REFINE_INTRINSICS = ("--BundleAdjustment.optimize_intrinsics",)
 USE_PRIOR_POSITION = ("--use_prior_position", "--Mapper.use_prior_position", "--PosePrior.use_pose_position_prior")
+OVERWRITE_PRIORS_COVARIANCE = ("--overwrite_priors_covariance", "--PosePrior.overwrite_priors_covariance")
+PRIOR_POSITION_STD_X = ("--prior_position_std_x", "--PosePrior.prior_position_std_x")
+PRIOR_POSITION_STD_Y = ("--prior_position_std_y", "--PosePrior.prior_position_std_y")
+PRIOR_POSITION_STD_Z = ("--prior_position_std_z", "--PosePrior.prior_position_std_z")
 FIX_EXISTING_FRAMES = ("--fix_existing_frames", "--Mapper.fix_existing_frames", "--Mapper.fix_existing_images")
 USE_PRIOR_GRAVITY = ("--use_prior_gravity", "--GlobalMapper.ra_use_gravity")
 EXTRACT_COLORS = ("--extract_colors", "--Mapper.extract_colors")
@@ -44,7 +48,6 @@ _IGNORED = {
         image_list_path constraint_type ba_iteration_num retriangulation_iteration_num output_format
         skip_preprocessing skip_view_graph_calibration skip_relative_pose_estimation skip_rotation_averaging
         skip_track_establishment skip_global_positioning skip_bundle_adjustment skip_retriangulation skip_pruning
-        prior_position_std_x prior_position_std_y prior_position_std_z overwrite_priors_covariance
         use_robust_loss_on_prior_position prior_position_loss_scale
         """,
     "Mapper.": """
@@ -96,8 +99,7 @@ _IGNORED = {
         max_epipolar_error_H min_inlier_ratio
         """,
     "PosePrior.": """
-        prior_position_std_x prior_position_std_y prior_position_std_z
-        overwrite_priors_covariance use_robust_loss_on_prior_position prior_position_loss_threshold
+        use_robust_loss_on_prior_position prior_position_loss_threshold
         prior_position_scaled_loss_factor alignment_ransac_max_error
         """,
 }
@@ -112,6 +114,10 @@ OBEYED = (
     *REFINE_INTRINSICS,
     *FIX_EXISTING_FRAMES,
     *USE_PRIOR_POSITION,
+    *OVERWRITE_PRIORS_COVARIANCE,
+    *PRIOR_POSITION_STD_X,
+    *PRIOR_POSITION_STD_Y,
+    *PRIOR_POSITION_STD_Z,
     *USE_PRIOR_GRAVITY,
     *EXTRACT_COLORS,
     *NUM_THREADS,

@@ -258,6 +258,26 @@ class ModelFlags:
             help="Georeference models by the GPS or other measured positions in the database.",
         ),
     ] = "1"
+    overwrite_priors_covariance: Annotated[
+        Switch,
+        _switch(
+            *colmap_flags.OVERWRITE_PRIORS_COVARIANCE,
+            help="Weigh measured positions by --prior_position_std_x, _y and _z instead of the database's covariances.",
+        ),
+    ] = "0"
+    prior_position_std_x: Annotated[
+        float,
+        typer.Option(
+            *colmap_flags.PRIOR_POSITION_STD_X,
+            help="Standard deviation of measured positions, metres east, or the unit of Cartesian ones along x.",
+        ),
+    ] = 1.0
+    prior_position_std_y: Annotated[
+        float, typer.Option(*colmap_flags.PRIOR_POSITION_STD_Y, help="The same, metres north, or along y.")
+    ] = 1.0
+    prior_position_std_z: Annotated[
+        float, typer.Option(*colmap_flags.PRIOR_POSITION_STD_Z, help="The same, metres up, or along z.")
+    ] = 1.0
     extract_colors: Annotated[
         Switch, _switch(*colmap_flags.EXTRACT_COLORS, help="Colour points from the photographs.")
     ] = "1"

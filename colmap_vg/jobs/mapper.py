@@ -32,6 +32,7 @@ from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, po
 from colmap_vg.mapping.weak_cuts import WeakCut, weak_cuts
 from colmap_vg.options import MappingOptions, SolveOptions
 from colmap_vg.reading.read import read_with_caveats
+from colmap_vg.scene.pose_priors import PosePriors
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.scene.view_graph import ViewGraph
@@ -271,9 +272,9 @@ def _build(
 def _georeferenced(
     cache: "pycolmap.DatabaseCache", models: list[BuiltModel], graph: ViewGraph, options: MappingOptions, log: StageLog
 ) -> list[BuiltModel]:
-    """Move models to the frame of their measured positions, if there are any and they are wanted."""
+    """Move models to the frame of their measured positions, if there are any."""
     priors = graph.priors
-    if not options.use_prior_position or priors is None or not priors.has_position.any():
+    if priors is None or not priors.has_position.any():
         return models
     with log.stage("georeference"):
         placed = [
@@ -363,8 +364,21 @@ def _read(
             check_image_names(given, graph.image_names)
         for caveat in caveats:
             log.warn(caveat)
+        graph = replace(graph, priors=_wanted_priors(graph.priors, options))
         log.result(f"{graph.num_images} images, {graph.num_edges} pairs, {int(graph.has_rotation.sum())} usable")
     return graph
+
+
+def _wanted_priors(priors: PosePriors | None, options: MappingOptions) -> PosePriors | None:
+    if priors is None:
+        return None
+    if not options.use_prior_position:
+        return priors.without_positions()
+    if options.overwrite_priors_covariance:
+        return priors.with_sigmas(
+            (options.prior_position_std_x, options.prior_position_std_y, options.prior_position_std_z)
+        )
+    return priors
 
 
 def _solve(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:

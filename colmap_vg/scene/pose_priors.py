@@ -1,6 +1,6 @@
 """Measured positions and gravity of images, which constrain poses from outside of the photographs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,17 @@ class PosePriors:
         for name, shape in {"positions": (n, 3), "covariances": (n, 3, 3), "gravities": (n, 3)}.items():
             if getattr(self, name).shape != shape:
                 raise GraphError(f"PosePriors.{name} has shape {getattr(self, name).shape}, expected {shape}")
+
+    def without_positions(self) -> "PosePriors":
+        """Gravity only."""
+        return replace(
+            self, positions=np.full_like(self.positions, np.nan), covariances=np.full_like(self.covariances, np.nan)
+        )
+
+    def with_sigmas(self, sigmas: tuple[float, float, float]) -> "PosePriors":
+        """Priors with the same standard deviations of all positions, along the axes of their frame."""
+        covariance = np.where(self.has_position[:, None, None], np.diag(np.square(sigmas)), np.nan)
+        return replace(self, covariances=covariance)
 
     @property
     def has_position(self) -> BoolArray:

@@ -62,6 +62,7 @@ def solve_view_graph(
         if part.num_images < MIN_PART_IMAGES:
             state.remove_images(part, ImageVerdict.SMALLER_COMPONENT)
             state.link_by_rigs()
+            state.link_by_positions()
             return state.solution()
         solved, poses = _solve_part(state, part, options, initial[part.images])
         if poses is None:

@@ -11,6 +11,7 @@ from colmap_vg.scene.subgraph import Subgraph
 from colmap_vg.scene.verdicts import USED_EDGES, EdgeVerdict, ImageVerdict, SolutionStatus
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.solver.agreement import pair_agreement
+from colmap_vg.solver.position_links import link_by_positions
 from colmap_vg.solver.rig_links import link_components
 from colmap_vg.solver.rigidity import largest_rigid_component
 
@@ -176,7 +177,23 @@ class SolverState:
         rigs = self.graph.rigs
         if rigs is None or self._component.max(initial=-1) < 1:
             return
-        before, self._component = self._component, link_components(rigs, self._R, self._p, self._component)
+        self._take_links(
+            link_components(rigs, self._R, self._p, self._component),
+            "images are linked to the others by their rig alone: no pair confirms their place.",
+        )
+
+    def link_by_positions(self) -> None:
+        """Join components that a pair and measured positions link, and normalise the result as one component."""
+        if self.graph.priors is None or self._component.max(initial=-1) < 1:
+            return
+        self._take_links(
+            link_by_positions(self.graph, self.edge_verdicts == EdgeVerdict.KEPT, self._R, self._p, self._component),
+            "images are linked to the others by one pair only: their scale is that of the measured positions.",
+        )
+
+    def _take_links(self, component: IntArray, told: str) -> None:
+        """Normalise components that grew by others, and say how many images were linked."""
+        before, self._component = self._component, component
         for grown in np.unique(self._component[self._component != before]):
             inside = self._component == grown
             moved = self._p[inside] - self._p[inside].mean(axis=0)
@@ -186,10 +203,7 @@ class SolverState:
                 # Those of the linked images lack the link's own uncertainty.
                 self._covariances[0, inside & (before != grown)] = np.nan
                 self._covariances[0, inside & (before == grown)] /= unit**2
-            self.caveats.append(
-                f"{int((inside & (before != grown)).sum())} images are linked to the others by their rig alone: no pair"
-                " confirms their place."
-            )
+            self.caveats.append(f"{int((inside & (before != grown)).sum())} {told}")
         self._component[self._component >= 0] = np.unique(self._component[self._component >= 0], return_inverse=True)[1]
 
     def solution(self) -> PoseSolution:

@@ -94,6 +94,26 @@ def test_precise_positions_straighten_a_model(plain: Path, flight: SyntheticView
     assert with_priors < 0.3 * np.sqrt(np.mean(errors_in_frame(aligned, truth) ** 2))
 
 
+def test_standard_deviations_of_the_caller_replace_those_of_the_database(
+    plain: Path, flight: SyntheticViews, tmp_path: Path
+) -> None:
+    path = Path(shutil.copyfile(plain, tmp_path / "database.db"))
+    truth = METRES * flight.projection_centers
+    noise = np.random.default_rng(3).normal(size=truth.shape) * [0.01, 0.01, 20.0]
+    write_priors(path, [prior(k + 1, x, "WGS84", 10.0) for k, x in enumerate(by_gps(truth + noise))])
+    line = ["mapper", "--database_path", str(path), "--output_path", str(tmp_path / "out"), "--report", "0"]
+    line += ["--overwrite_priors_covariance", "1", "--PosePrior.prior_position_std_x", "0.01"]
+    line += ["--prior_position_std_y", "0.01", "--prior_position_std_z", "20"]
+    told = CliRunner().invoke(app, line)
+    assert told.exit_code == 0, told.output
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())["models"][0]["georeference"]
+    # Horizontal residuals are small only where vertical ones, which are two thousand times as uncertain, weigh little.
+    assert found["sigmas"][2] == pytest.approx(20.0, rel=0.3)
+    residuals = np.array(list(found["residuals"].values()))
+    assert np.abs(residuals[:, :2]).max() < 0.2
+    assert np.abs(residuals[:, 2]).max() > 10.0
+
+
 def test_a_straight_flight_is_level(tmp_path: Path) -> None:
     street = synthetic_views("street", 30, noise_px=0.3)
     write_synthetic_database(tmp_path / "database.db", street)
@@ -111,6 +131,46 @@ def test_a_straight_flight_is_level(tmp_path: Path) -> None:
     down = [im.cam_from_world().rotation.matrix()[1, 2] for im in result.models[0].images.values() if im.has_pose]
     assert np.mean(down) < -0.9
     assert np.sqrt(np.mean(errors_in_frame(result, truth) ** 2)) < 3.0 * np.sqrt(7 / 30) * 1.5
+
+
+def with_gap(views: SyntheticViews, last: int) -> SyntheticViews:
+    """Views with one pair only across the gap behind an image, none of whose points a third image sees."""
+    first, second = views.pairs.T
+    across = (np.minimum(first, second) <= last) & (np.maximum(first, second) > last)
+    kept = np.flatnonzero(~across | ((first == last) & (second == last + 1)))
+    keypoints, matches = list(views.keypoints), [views.matches[k] for k in kept]
+    own = int(np.flatnonzero(across[kept])[0])
+    rows = []
+    for side, image in enumerate((last, last + 1)):
+        rows.append(len(keypoints[image]) + np.arange(len(matches[own])))
+        keypoints[image] = np.concatenate([keypoints[image], keypoints[image][matches[own][:, side]]])
+    matches[own] = np.stack(rows, axis=1)
+    return replace(
+        views,
+        keypoints=tuple(keypoints),
+        pairs=views.pairs[kept],
+        matches=tuple(matches),
+        relative_rotations=views.relative_rotations[kept],
+        directions=views.directions[kept],
+        wrong=views.wrong[kept],
+    )
+
+
+def test_positions_link_what_one_pair_does_not(tmp_path: Path) -> None:
+    """The pair tells no scale across the gap of a flight line; the positions do."""
+    street = with_gap(synthetic_views("street", 30, noise_px=0.3), 16)
+    write_synthetic_database(tmp_path / "database.db", street)
+    truth = METRES * street.projection_centers
+    measured = truth + 3.0 * np.random.default_rng(0).normal(size=truth.shape)
+    write_priors(tmp_path / "database.db", [prior(k + 1, x, "WGS84") for k, x in enumerate(by_gps(measured))])
+    result, warnings = mapped(tmp_path / "database.db", tmp_path / "out")
+    assert warnings[0].startswith("13 images are linked to the others by one pair only")
+    assert list(result.models) == [0]
+    errors = errors_in_frame(result, truth)
+    assert len(errors) == 30
+    assert np.sqrt(np.mean(errors**2)) < 3.0 * np.sqrt(11 / 30) * 1.5
+    result, _ = mapped(tmp_path / "database.db", tmp_path / "alone", use_prior_position=False)
+    assert [model.num_reg_images() for model in result.models.values()] == [17, 13]
 
 
 @pytest.mark.parametrize("system", ["CARTESIAN", "WGS84"])
