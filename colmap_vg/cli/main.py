@@ -185,7 +185,10 @@ def export(
     output_path: Annotated[
         Path, typer.Option("--output_path", help="A file for ply, tum and g2o, a folder for the other formats.")
     ],
-    format: Annotated[ExportFormat, typer.Option("--format", help="What to write: see docs/exports.md.")],
+    format: Annotated[
+        ExportFormat,
+        typer.Option("--format", help="Format of the output. splat: undistorted images and pinhole cameras."),
+    ],
     image_path: Annotated[
         Path | None,
         typer.Option(

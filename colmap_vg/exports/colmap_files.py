@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pycolmap
+
 from colmap_vg.colmap_io.reconstruction import write_model
 from colmap_vg.errors import MappingError, OutputError
 from colmap_vg.exports.source import Source
@@ -24,10 +26,15 @@ def write_text(source: Source, folder: Path) -> list[str]:
             raise MappingError(
                 f"COLMAP's text format cannot hold the image name {image.name!r}, which has white space: export binary"
             )
+    model = source.reconstruction
     try:
-        source.reconstruction.write_text(folder)
-    except (OSError, RuntimeError, ValueError) as error:
+        model.write_text(folder)
+        written = pycolmap.Reconstruction(folder)
+    except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise OutputError(f"cannot write a model to {folder} ({error}); choose another output_path") from error
+    # COLMAP does not check whether its files could be written.
+    if written.num_reg_images() != model.num_reg_images() or written.num_points3D() != model.num_points3D():
+        raise OutputError(f"the model in {folder} is incomplete: free disk space or choose another output_path")
     return []
 
 
@@ -54,6 +61,6 @@ def write_ply(source: Source, path: Path) -> list[str]:
         source.reconstruction.export_PLY(path)
     except (OSError, RuntimeError, ValueError) as error:
         raise OutputError(f"cannot write {path} ({error}); choose another output_path") from error
-    if path.stat().st_size < 15 * num_points:  # COLMAP does not check whether its files could be written
+    if path.stat().st_size < 15 * num_points:  # a full disk is no error to COLMAP
         raise OutputError(f"{path} is incomplete: free disk space or choose another output_path")
     return []
