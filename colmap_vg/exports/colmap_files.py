@@ -9,6 +9,8 @@ from colmap_vg.errors import MappingError, OutputError
 from colmap_vg.exports.source import Source
 
 _WHITE_SPACE = frozenset(" \t\n\v\f\r")
+_END_OF_HEADER, _MAX_HEADER, _BYTES_PER_POINT = b"end_header\n", 1024, 15
+"""Of COLMAP's PLY files: three coordinates in single precision and three bytes of colour per point."""
 
 
 def write_text(source: Source, folder: Path) -> list[str]:
@@ -31,7 +33,9 @@ def write_text(source: Source, folder: Path) -> list[str]:
         model.write_text(folder)
         written = pycolmap.Reconstruction(folder)
     except (OSError, RuntimeError, ValueError, IndexError) as error:
-        raise OutputError(f"cannot write a model to {folder} ({error}); choose another output_path") from error
+        raise OutputError(
+            f"COLMAP's text files cannot be written in full ({error}): free disk space or choose another output_path"
+        ) from error
     # COLMAP does not check whether its files could be written.
     if written.num_reg_images() != model.num_reg_images() or written.num_points3D() != model.num_points3D():
         raise OutputError(f"the model in {folder} is incomplete: free disk space or choose another output_path")
@@ -61,6 +65,8 @@ def write_ply(source: Source, path: Path) -> list[str]:
         source.reconstruction.export_PLY(path)
     except (OSError, RuntimeError, ValueError) as error:
         raise OutputError(f"cannot write {path} ({error}); choose another output_path") from error
-    if path.stat().st_size < 15 * num_points:  # a full disk is no error to COLMAP
+    with path.open("rb") as file:  # a full disk is no error to COLMAP
+        header = file.read(_MAX_HEADER).partition(_END_OF_HEADER)[0]
+    if path.stat().st_size != len(header) + len(_END_OF_HEADER) + _BYTES_PER_POINT * num_points:
         raise OutputError(f"{path} is incomplete: free disk space or choose another output_path")
     return []

@@ -1,6 +1,7 @@
 """The verb, and what all formats have in common."""
 
 import json
+import resource
 from pathlib import Path
 from typing import get_args
 
@@ -10,7 +11,8 @@ from typer.testing import CliRunner, Result
 
 import colmap_vg
 from colmap_vg.cli.main import app
-from colmap_vg.errors import OptionError
+from colmap_vg.errors import MappingError, OptionError, OutputError
+from colmap_vg.exports.source import find_source
 from colmap_vg.options import ExportFormat
 
 FORMATS = get_args(ExportFormat)
@@ -75,3 +77,19 @@ def test_options_of_other_formats_are_refused(job: Path, tmp_path: Path) -> None
     assert "for the format splat only" in done.stderr
     with pytest.raises(OptionError, match=r"format must be one of text, .* found 'obj'"):
         colmap_vg.export_model(job, tmp_path / "o", "obj")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_files_that_are_cut_are_no_export(job: Path, tmp_path: Path, format: str) -> None:
+    source, limits = find_source(job), resource.getrlimit(resource.RLIMIT_FSIZE)
+    assert source.image_path is not None
+    colmap_vg.export_model(job, tmp_path / "whole", format)  # type: ignore[arg-type]
+    whole = contents(tmp_path / "whole").values() if format not in FILES else [(tmp_path / "whole").read_bytes()]
+    before = contents(tmp_path)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (max(map(len, whole)) - 100, limits[1]))
+    try:
+        with pytest.raises((OutputError, MappingError), match="disk space"):
+            colmap_vg.export_model(job, tmp_path / "out", format)  # type: ignore[arg-type]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert contents(tmp_path) == before
