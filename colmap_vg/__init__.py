@@ -24,6 +24,7 @@ _HOME = {
     "SolveOptions": "options",
     "ViewGraph": "scene.view_graph",
     "align_positions": "geometry.similarity",
+    "export_model": "exports.export",
     "image_folder_mapping": "jobs.image_folder",
     "read_1dsfm": "datasets.one_dsfm_folder",
     "read_bundle": "datasets.bundle",
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from colmap_vg.datasets.bundle import read_bundle
     from colmap_vg.datasets.one_dsfm_folder import read_1dsfm
     from colmap_vg.errors import ColmapVgError
+    from colmap_vg.exports.export import export_model
     from colmap_vg.geometry.similarity import Similarity, align_positions
     from colmap_vg.jobs.image_folder import image_folder_mapping
     from colmap_vg.jobs.mapper import view_graph_mapping
@@ -64,6 +66,7 @@ __all__ = [
     "ViewGraph",
     "__version__",
     "align_positions",
+    "export_model",
     "image_folder_mapping",
     "read_1dsfm",
     "read_bundle",

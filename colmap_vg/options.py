@@ -16,6 +16,7 @@ CameraMode = Literal["auto", "single", "per_folder", "per_image"]
 Extractor = Literal["opencv", "colmap"]
 RigLayout = Literal["none", "folders"]
 Matching = Literal["auto", "exhaustive", "selected", "sequential", "spatial"]
+ExportFormat = Literal["text", "binary", "ply", "nerfstudio", "bundler", "tum", "g2o", "splat"]
 
 
 def _number(default: float, low: float, high: float = float("inf")) -> Any:

@@ -8,7 +8,18 @@ from pathlib import Path
 
 import colmap_vg
 
-ABOVE_THE_NUMERICS = ("cli", "report", "demo", "jobs", "reading", "features", "mapping", "colmap_io", "simulation")
+ABOVE_THE_NUMERICS = (
+    "cli",
+    "report",
+    "exports",
+    "demo",
+    "jobs",
+    "reading",
+    "features",
+    "mapping",
+    "colmap_io",
+    "simulation",
+)
 
 
 def run_python(code: str) -> str:

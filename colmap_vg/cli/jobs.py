@@ -35,7 +35,7 @@ from colmap_vg.jobs.verdict_tables import (
     write_tables,
 )
 from colmap_vg.mapping.weak_cuts import WeakCut
-from colmap_vg.options import FeatureOptions, MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.options import ExportFormat, FeatureOptions, MappingOptions, ReadOptions, SolveOptions
 from colmap_vg.report.page import write_report
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.scene.view_graph import ViewGraph
@@ -239,6 +239,33 @@ def align(
         log=StageLog(reporter.on_event),
     )
     reporter.say(f"{output_path / '0'}: {georeference_line(asdict(found))}")
+
+
+def export(
+    input_path: Path,
+    output_path: Path,
+    format: ExportFormat,
+    image_path: Path | None,
+    model: int | None,
+    max_image_size: int | None,
+    overwrite: bool,
+    reporter: Reporter,
+) -> None:
+    """A model in the format of another program."""
+    from colmap_vg.exports.export import export_model
+
+    configure_colmap_log(reporter.verbose)
+    done = export_model(
+        input_path,
+        output_path,
+        format,
+        image_path=image_path,
+        model=model,
+        max_image_size=max_image_size,
+        overwrite=overwrite,
+    )
+    notes = "".join(f"; {note}" for note in done.notes)
+    reporter.say(f"{done.path}: {done.num_images} images, {done.num_points} points{notes}")
 
 
 def report(output_path: Path, image_path: Path | None, database_path: Path | None, reporter: Reporter) -> None:

@@ -15,6 +15,7 @@ from colmap_vg.cli.flags import takes_flags
 from colmap_vg.cli.reporter import Reporter
 from colmap_vg.cli.wording import with_flags
 from colmap_vg.errors import ColmapVgError, OptionError
+from colmap_vg.options import ExportFormat
 
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of wrong usage, and of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
@@ -174,6 +175,40 @@ def align(
         import colmap_vg.cli.jobs as jobs
 
         jobs.align(input_path, output_path, ref_images_path, ref_points_path, ref_is_gps, overwrite, reporter)
+
+
+@app.command()
+def export(
+    input_path: Annotated[
+        Path, typer.Option("--input_path", help="Folder of a model, or of a finished job. It is not changed.")
+    ],
+    output_path: Annotated[
+        Path, typer.Option("--output_path", help="A file for ply, tum and g2o, a folder for the other formats.")
+    ],
+    format: Annotated[
+        ExportFormat,
+        typer.Option("--format", help="Format of the output. splat: undistorted images and pinhole cameras."),
+    ],
+    image_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--image_path", help="Folder of the photographs, for nerfstudio and splat. Default: that of the job."
+        ),
+    ] = None,
+    model: Annotated[
+        int | None, typer.Option("--model", min=0, help="Which of the job's models. Default: the first.")
+    ] = None,
+    max_image_size: Annotated[
+        int | None,
+        typer.Option("--max_image_size", min=1, help="Longer side of the undistorted images of splat, in pixels."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
+) -> None:
+    """Write a model in the format of another program: undistorted images for splatting, nerfstudio, PLY and others."""
+    with _job(False, False) as reporter:
+        import colmap_vg.cli.jobs as jobs
+
+        jobs.export(input_path, output_path, format, image_path, model, max_image_size, overwrite, reporter)
 
 
 @app.command()

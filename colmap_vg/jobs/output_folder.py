@@ -199,24 +199,43 @@ def publish_models(staged: Sequence[Path], output_path: str | PathLike[str]) -> 
         A folder cannot be renamed.
     """
     output, replaced = Path(output_path), Path(output_path) / WORK_NAME / "replaced"
-    moved: list[tuple[Path, Path]] = []
     try:
         shutil.rmtree(replaced, ignore_errors=True)
         replaced.mkdir(parents=True)
         old = [(path, replaced / path.name) for path in existing_models(output) if path != output]
         new = [(path, output / str(index)) for index, path in enumerate(staged)]
-        for source, target in old + new:
-            source.rename(target)
-            moved.append((source, target))
+        rename_all(old + new)
     except OSError as error:
-        with suppress(OSError):
-            for source, target in reversed(moved):
-                target.rename(source)
         raise OutputError(f"cannot move the models to {output}: {error.strerror} ({error.filename})") from error
     shutil.rmtree(replaced, ignore_errors=True)
     with suppress(OSError):
         (output / WORK_NAME / STAGE_NAME).rmdir()
     return [target for _, target in new]
+
+
+def rename_all(moves: Sequence[tuple[Path, Path]]) -> None:
+    """Rename files or folders in turn, or none of them: when one fails, those before it are renamed back.
+
+    Parameters
+    ----------
+    moves : sequence of (Path, Path)
+        Old and new path of each, on one file system.
+
+    Raises
+    ------
+    OSError
+        One cannot be renamed.
+    """
+    moved: list[tuple[Path, Path]] = []
+    try:
+        for source, target in moves:
+            source.rename(target)
+            moved.append((source, target))
+    except OSError:
+        with suppress(OSError):
+            for source, target in reversed(moved):
+                target.rename(source)
+        raise
 
 
 def stage_models(work: Path, num_models: int) -> list[Path]:

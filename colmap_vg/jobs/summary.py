@@ -117,6 +117,14 @@ def read_summary(output_path: Path) -> dict[str, Any]:
     return content
 
 
+def given_path(summary: Mapping[str, Any], option: str, beside: Path) -> Path | None:
+    """Return the path that a finished job was given, or the one in its output folder; None where neither exists."""
+    options = summary.get("options")
+    given = options.get(option) if isinstance(options, dict) else None
+    paths = [Path(given)] if isinstance(given, str) else []
+    return next((path for path in [*paths, beside] if path.exists()), None)
+
+
 def damaged_summary(output_path: Path) -> OutputError:
     """Return the error for a summary that lacks what this version writes."""
     return OutputError(f"{output_path / FILE_NAME} is damaged or was written by another version: run the job again")

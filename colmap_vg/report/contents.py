@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from colmap_vg.errors import DatabaseError
 from colmap_vg.jobs.image_folder import DATABASE_NAME
 from colmap_vg.jobs.output_folder import existing_models
-from colmap_vg.jobs.summary import read_summary
+from colmap_vg.jobs.summary import given_path, read_summary
 from colmap_vg.jobs.verdict_tables import ImageRow, PairRow, read_tables
 from colmap_vg.report.matches import MAX_MATCHES, pair_matches
 from colmap_vg.report.models import MAX_POINTS, ModelView, model_view, read_model
@@ -71,10 +71,10 @@ def gather(output_path: Path, image_path: Path | None = None, database_path: Pat
     rows = {row.image: index for index, row in enumerate(tables.images)}
     models = _models(output_path, rows, notes)
     pairs = _shown_pairs(tables.pairs, notes)
-    database_path = database_path or _existing(summary, "database_path", output_path / DATABASE_NAME)
+    database_path = database_path or given_path(summary, "database_path", output_path / DATABASE_NAME)
     matches = _worst_matches(database_path, pairs, notes)
     previews = {rows[name] for k in matches for name in (pairs[k].image1, pairs[k].image2) if name in rows}
-    image_path = image_path or _existing(summary, "image_path", output_path / "images")
+    image_path = image_path or given_path(summary, "image_path", output_path / "images")
     photographs = _photographs(image_path, tables.images, previews, notes)
     return Contents(summary, tables.images, pairs, models, photographs, matches, tuple(notes))
 
@@ -165,11 +165,3 @@ def _photographs(
     if missing:
         notes.append(f"{missing} photographs are missing or cannot be read.")
     return tuple(found)
-
-
-def _existing(summary: Mapping[str, Any], option: str, beside: Path) -> Path | None:
-    """The path that the job was given, or the one in its output folder; None where neither exists."""
-    options = summary.get("options")
-    given = options.get(option) if isinstance(options, dict) else None
-    paths = [Path(given)] if isinstance(given, str) else []
-    return next((path for path in [*paths, beside] if path.exists()), None)
