@@ -125,6 +125,14 @@ def triangulate_registered(mapper: "pycolmap.IncrementalMapper", options: Mappin
         log.result(f"{mapper.reconstruction.num_points3D()} points")
 
 
+def settle_given_poses(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, held: Held) -> None:
+    """Fit given poses and newly triangulated points to each other; where poses are held, keep the points that fit."""
+    if held.frames:
+        _filter(mapper)
+    else:
+        _adjust_to_convergence(mapper, options, held)
+
+
 def finish_registration(
     mapper: "pycolmap.IncrementalMapper",
     options: MappingOptions,

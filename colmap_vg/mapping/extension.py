@@ -12,7 +12,7 @@ from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.errors import DataFileError
 from colmap_vg.events import StageLog
 from colmap_vg.geometry.similarity import align_positions
-from colmap_vg.mapping.build import BuildResult, finish_registration, triangulate_registered
+from colmap_vg.mapping.build import BuildResult, finish_registration, settle_given_poses, triangulate_registered
 from colmap_vg.mapping.bundle import held_of
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.options import MappingOptions
@@ -104,11 +104,12 @@ def extend_model(
         log.result(f"{len(old)} images and {copied} points of the given model")
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
-    if copied == 0:
-        triangulate_registered(mapper, options, log)
     frames = {model.image(image_id).frame_id for image_id in old.values()}
     # Images of given frames would move with the places of their sensors.
     held = held_of(model, frozenset(frames)) if options.fix_existing_frames else held_of(cache)
+    if copied == 0:
+        triangulate_registered(mapper, options, log)
+        settle_given_poses(mapper, options, held)
     result = finish_registration(mapper, options, log, pairs, held, frozenset(frames))
     mapper.end_reconstruction(False)
     if not options.fix_existing_frames:

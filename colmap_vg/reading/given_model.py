@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, focal_length
 from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.tables import DEGENERATE, WATERMARK, DatabaseTables
+from colmap_vg.errors import DataFileError
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.options import ReadOptions
 from colmap_vg.scene.verdicts import EdgeVerdict
@@ -31,6 +32,8 @@ MAX_ERROR_PX = 4.0
 """COLMAP's threshold of two-view verification, pixels."""
 MIN_SHARE_AGREEING = 0.8
 """Minimum share of a pair's matches within the threshold for the model to explain it."""
+MIN_SHARE_EXPLAINED = 0.5
+"""Minimum share of its pairs that a model explains, or else a warning: false pairs are fewer than the others."""
 MAX_MATCHES_CHECKED = 100
 """Maximum number of a pair's matches that are compared with the model."""
 
@@ -58,6 +61,11 @@ def with_given_cameras(tables: DatabaseTables, model: "pycolmap.Reconstruction")
     """Find a model's poses by image names, and give the database's cameras its calibrations.
 
     A camera whose images have several calibrations in the model gets that of the first.
+
+    Raises
+    ------
+    DataFileError
+        A camera has another image size in the model.
     """
     rows = {name: row for row, name in enumerate(tables.image_names)}
     n = len(tables.image_ids)
@@ -74,11 +82,16 @@ def with_given_cameras(tables: DatabaseTables, model: "pycolmap.Reconstruction")
         camera = int(tables.camera_idx[row])
         if not calibrated[camera]:
             calibrated[camera] = True
-            cameras[camera] = _with_calibration(cameras[camera], model.camera(image.camera_id))
+            cameras[camera] = _with_calibration(cameras[camera], model.camera(image.camera_id), image.name)
     return replace(tables, cameras=tuple(cameras)), GivenCameras(rotations, centers, calibrated)
 
 
-def _with_calibration(camera: "pycolmap.Camera", given: "pycolmap.Camera") -> "pycolmap.Camera":
+def _with_calibration(camera: "pycolmap.Camera", given: "pycolmap.Camera", name: str) -> "pycolmap.Camera":
+    if (given.width, given.height) != (camera.width, camera.height):
+        raise DataFileError(
+            f"{name}: {given.width} x {given.height} pixels in the given model, {camera.width} x {camera.height} in the"
+            " database; extract features from the photographs that the model was made of, or scale its cameras"
+        )
     return pycolmap.Camera(
         camera_id=camera.camera_id,
         model=given.model,
@@ -97,7 +110,9 @@ def of_pairs(tables: DatabaseTables, chosen: BoolArray) -> DatabaseTables:
     return replace(tables, matches=tables.matches[rows], offsets=offsets, **kept)
 
 
-def explained_pairs(tables: DatabaseTables, given: GivenCameras, options: ReadOptions) -> BoolArray:
+def explained_pairs(
+    tables: DatabaseTables, given: GivenCameras, options: ReadOptions
+) -> tuple[BoolArray, tuple[str, ...]]:
     """Pairs of two given images most of whose matches agree with the model.
 
     Parameters
@@ -110,7 +125,9 @@ def explained_pairs(tables: DatabaseTables, given: GivenCameras, options: ReadOp
 
     Returns
     -------
-    (m,) bool array
+    explained : (m,) bool array
+    caveats : tuple of str
+        A sentence if the model explains too few of its pairs.
     """
     has_pose = np.asarray(np.isfinite(given.centers).all(axis=1))
     chosen = np.asarray(has_pose[tables.pairs].all(axis=1))
@@ -132,8 +149,15 @@ def explained_pairs(tables: DatabaseTables, given: GivenCameras, options: ReadOp
         focals[part.pairs[:, 1]],
     )
     agree = segment_sums(part.offsets, (valid & (np.abs(errors) <= MAX_ERROR_PX)).astype(np.float64))
-    chosen[chosen] = agree >= MIN_SHARE_AGREEING * np.diff(part.offsets)
-    return chosen
+    good = agree >= MIN_SHARE_AGREEING * np.diff(part.offsets)
+    chosen[chosen] = good
+    if good.sum() >= MIN_SHARE_EXPLAINED * len(good):
+        return chosen, ()
+    return chosen, (
+        f"The given model explains only {int(good.sum())} of {len(good)} pairs of its images: matches of the others are"
+        f" more than {MAX_ERROR_PX:.0f} px from where its cameras put them. Its poses or calibrations are not those of"
+        " these photographs, or are rough and have to be adjusted (with fix_existing_frames off).",
+    )
 
 
 def with_pairs_of_model(

@@ -68,9 +68,9 @@ def read_with_caveats(
         graph, caveats = _read(tables, database_path, options, np.zeros(len(tables.cameras), dtype=bool))
     else:
         tables, given = with_given_cameras(tables, model)
-        explained = explained_pairs(tables, given, options)
+        explained, told = explained_pairs(tables, given, options)
         graph, caveats = _read(of_pairs(tables, ~explained), database_path, options, given.calibrated)
-        graph = with_pairs_of_model(graph, tables, explained, given)
+        graph, caveats = with_pairs_of_model(graph, tables, explained, given), (*told, *caveats)
     priors, ignored = read_pose_priors(database_path, tables.image_ids.tolist())
     rigs = read_rigs(database_path, tables.image_ids)
     return replace(graph, priors=priors, rigs=rigs), (*caveats, *ignored)

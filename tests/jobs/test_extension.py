@@ -16,9 +16,10 @@ from colmap_vg import MappingOptions, align_positions, view_graph_mapping
 from colmap_vg.cli.main import app
 from colmap_vg.errors import DataFileError
 from colmap_vg.events import StageLog
+from colmap_vg.geometry import so3
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.simulation.database import write_synthetic_database
-from colmap_vg.simulation.views import synthetic_views
+from colmap_vg.simulation.views import FOCAL_PX, HEIGHT, WIDTH, SyntheticViews, synthetic_views
 
 OPTIONS = MappingOptions(num_threads=1, extract_colors=False)
 NEW = (3, 8, 13, 18, 23)
@@ -109,6 +110,68 @@ def test_a_model_of_other_keypoints_gives_its_poses_only(scene: Path, tmp_path: 
     names = sorted(poses(joint))
     distances, _ = align_positions(centers(models[0], names), centers(joint, names))
     assert distances.max() < 1e-3 * radius(centers(joint, names))
+
+
+def known_poses(folder: Path, views: SyntheticViews, sigma: float, names: range, width: int = WIDTH) -> Path:
+    """A text model of poses only, turned by `sigma` radians and shifted by a third of the distance of neighbours."""
+    rng = np.random.default_rng(0)
+    lines = []
+    for k in names:
+        R = so3.exp(sigma * rng.standard_normal((1, 3)))[0] @ views.cam_from_world_rotations[k]
+        center = views.projection_centers[k] + 10.0 * sigma * rng.standard_normal(3)
+        x, y, z, w = pycolmap.Rotation3d(R).quat
+        lines.append(" ".join(map(str, [k + 1, w, x, y, z, *(-R @ center), 1, f"{k:05d}.jpg\n\n"])))
+    folder.mkdir()
+    (folder / "cameras.txt").write_text(f"1 SIMPLE_PINHOLE {width} {HEIGHT} {FOCAL_PX} {width / 2} {HEIGHT / 2}\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("")
+    return folder
+
+
+@pytest.mark.parametrize("num_known", [25, 20])
+def test_rough_known_poses_are_adjusted(scene: Path, tmp_path: Path, num_known: int) -> None:
+    """As from an inertial sensor or a simulator, written as a text model: poses are 1 degree off."""
+    views = synthetic_views("drone", 25, noise_px=0.5)
+    known, log = known_poses(tmp_path / "known", views, 0.02, range(num_known)), StageLog()
+    options = replace(OPTIONS, fix_existing_frames=False)
+    result = map_database(scene / "all.db", None, tmp_path / "out", options, log, known)
+    assert result.solution.registered.all()
+    names = [f"{k:05d}.jpg" for k in range(25)]
+    of_result, of_joint = (
+        align_positions(centers(model, names), views.projection_centers)[0].mean()
+        for model in (result.models[0], pycolmap.Reconstruction(scene / "joint" / "0"))
+    )
+    assert of_result < 1.1 * of_joint
+    given = centers(pycolmap.Reconstruction(known), names[:num_known])
+    moved = centers(result.models[0], names[:num_known]) - given
+    assert np.linalg.norm(moved.mean(axis=0)) < 0.01  # in the frame of the given poses
+    assert any("The given model explains only" in warning for warning in log.warnings)
+
+
+def test_rough_known_poses_that_are_kept_get_no_points_that_do_not_fit(scene: Path, tmp_path: Path) -> None:
+    known, log = (
+        known_poses(tmp_path / "known", synthetic_views("drone", 25, noise_px=0.5), 0.02, range(25)),
+        StageLog(),
+    )
+    model = map_database(scene / "all.db", None, tmp_path / "out", OPTIONS, log, known).models[0]
+    assert any("The given model explains only" in warning for warning in log.warnings)
+    assert model.compute_mean_reprojection_error() < 4.0
+
+
+def test_exact_known_poses_are_kept(scene: Path, tmp_path: Path) -> None:
+    views, log = synthetic_views("drone", 25, noise_px=0.5), StageLog()
+    known = known_poses(tmp_path / "known", views, 0.0, range(25))
+    model = map_database(scene / "all.db", None, tmp_path / "out", OPTIONS, log, known).models[0]
+    assert log.warnings == []
+    np.testing.assert_allclose(centers(model, ["00007.jpg"])[0], views.projection_centers[7], atol=1e-9)
+    assert model.num_points3D() > 3000
+    assert model.compute_mean_reprojection_error() < 1.0
+
+
+def test_calibrations_of_another_image_size_are_refused(scene: Path, tmp_path: Path) -> None:
+    known = known_poses(tmp_path / "known", synthetic_views("drone", 25), 0.0, range(25), width=800)
+    with pytest.raises(DataFileError, match="800 x 1200 pixels in the given model, 1600 x 1200 in the database"):
+        map_database(scene / "all.db", None, tmp_path / "out", OPTIONS, StageLog(), known)
 
 
 def test_images_that_do_not_belong_are_left_out_with_a_reason(scene: Path, tmp_path: Path) -> None:
