@@ -1,6 +1,7 @@
-"""Read the user's lists of image pairs: pairs to exclude, and trusted pairs that are never removed."""
+"""Read and write the user's lists of image pairs: pairs to exclude, and trusted pairs that are never removed."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -17,7 +18,8 @@ def read_pair_list(path: str | PathLike[str]) -> list[tuple[str, str]]:
     ----------
     path : path
         Two names per line, as in COLMAP's match lists, separated by a tab if names contain spaces. Empty lines and
-        lines that start with ``#`` are skipped.
+        lines that start with ``#`` are skipped. A line that starts with ``["`` is a JSON list of two names, which may
+        contain anything.
 
     Returns
     -------
@@ -29,17 +31,41 @@ def read_pair_list(path: str | PathLike[str]) -> list[tuple[str, str]]:
         The file cannot be read, or a line does not contain two names.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+        lines = Path(path).read_text(encoding="utf-8", errors="surrogateescape").split("\n")
     except OSError as error:
         raise DataFileError(f"cannot read the list of pairs {path}: {error.strerror}") from error
     pairs = []
     for number, line in enumerate(lines, start=1):
         if line.strip() and not line.startswith("#"):
-            names = [name.strip() for name in line.split("\t")] if "\t" in line else line.split()
+            names = _names(line)
             if len(names) != 2:
                 raise DataFileError(f"{path}, line {number}: two image names expected, found {line.strip()!r}")
             pairs.append((names[0], names[1]))
     return pairs
+
+
+def _names(line: str) -> list[str]:
+    if line.startswith('["'):
+        try:
+            found = json.loads(line)
+        except ValueError:
+            found = []
+        if isinstance(found, list) and all(isinstance(name, str) for name in found):
+            return found
+    return [name.strip() for name in line.split("\t")] if "\t" in line else line.split()
+
+
+def pair_list(pairs: Iterable[tuple[str, str]]) -> str:
+    r"""Text that :func:`read_pair_list` reads as the given pairs of image names, whatever these contain.
+
+    >>> pair_list([("a.jpg", "b.jpg"), ("c d.jpg", "e.jpg")])
+    'a.jpg\tb.jpg\n["c d.jpg", "e.jpg"]\n'
+    """
+    lines = []
+    for names in pairs:
+        plain = all(name and name.isprintable() and " " not in name and name[0] not in "#[" for name in names)
+        lines.append("\t".join(names) if plain else json.dumps(names))
+    return "".join(f"{line}\n" for line in lines)
 
 
 def listed_edges(path: str | PathLike[str] | None, names: Sequence[str], edges: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -15,6 +15,7 @@ from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cam
 from colmap_vg.errors import MappingError
 from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.jobs.finished_solution import solution_of_models, solution_of_reading, with_edges_of_models
+from colmap_vg.jobs.graph import read_job_graph, solve_job_graph, solve_options
 from colmap_vg.jobs.joining import BuiltModel, compared_images, join_models
 from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.mapping.build import (
@@ -24,15 +25,13 @@ from colmap_vg.mapping.build import (
     build_model,
 )
 from colmap_vg.mapping.colors import extract_colors
-from colmap_vg.mapping.extension import check_image_names, extend_model, read_input_model
+from colmap_vg.mapping.extension import extend_model, read_input_model
 from colmap_vg.mapping.georeference import Georeference, georeference
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.posed_model import posed_model, scale_is_uncertain, with_placed_sensors
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
 from colmap_vg.mapping.weak_cuts import WeakCut, weak_cuts
-from colmap_vg.options import MappingOptions, SolveOptions
-from colmap_vg.reading.read import read_with_caveats
-from colmap_vg.scene.pose_priors import PosePriors
+from colmap_vg.options import MappingOptions
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.scene.view_graph import ViewGraph
@@ -149,7 +148,7 @@ def map_database(
     refuse_models(output_path, options.overwrite)
     with work_folder(output_path, options.overwrite) as work:
         given = None if input_path is None else read_input_model(input_path)
-        graph = _read(database_path, options, log, given)
+        graph = read_job_graph(database_path, options, log, given)
         if given is None:
             solution, built = _solved_models(database_path, work, graph, options, log)
         else:
@@ -179,7 +178,7 @@ def _solved_models(
     database_path: str | PathLike[str], work: Path, graph: ViewGraph, options: MappingOptions, log: StageLog
 ) -> tuple[PoseSolution, list[BuiltModel]]:
     """Solve a viewing graph and build the models of its components."""
-    solution = _solve(graph, options, log)
+    solution = solve_job_graph(graph, options, log)
     if not solution.registered.any():
         raise MappingError(f"{database_path}: {solution.message}")
     if solution.arrangements and graph.has_inliers and options.solve.method == "epipolar":
@@ -296,7 +295,7 @@ def _second_opinion(
     """Choose among a solution's arrangements of the images by their missing correspondences."""
     with log.stage("second opinion"):
         # All arrangements are solved with the same reduced effort, so that the comparison is fair.
-        rough = replace(_solve_options(options), refine_focal_lengths="never", max_matches_per_edge=ROUGH_MATCHES)
+        rough = replace(solve_options(options), refine_focal_lengths="never", max_matches_per_edge=ROUGH_MATCHES)
         found = [
             _point_evidence(database_path, work, graph, solve_view_graph(graph, rough, rotations), options)
             for rotations in solution.arrangements
@@ -306,7 +305,7 @@ def _second_opinion(
         best, settled = best_arrangement(found)
         chosen, in_doubt = solution, None if settled else solution.in_doubt
         if best > 0:
-            chosen = solve_view_graph(graph, _solve_options(options), solution.arrangements[best])
+            chosen = solve_view_graph(graph, solve_options(options), solution.arrangements[best])
             for caveat in chosen.caveats:
                 log.warn(caveat)
             log.warn(
@@ -344,55 +343,6 @@ def _pair_rotations(graph: ViewGraph) -> PairRotations:
     posed = graph.has_rotation
     matches = np.ones(graph.num_edges) if graph.num_inliers is None else graph.num_inliers.astype(np.float64)
     return PairRotations(graph.image_ids[graph.edges[posed]], graph.cam2_from_cam1_rotations[posed], matches[posed])
-
-
-def _read(
-    database_path: str | PathLike[str],
-    options: MappingOptions,
-    log: StageLog,
-    given: "pycolmap.Reconstruction | None" = None,
-) -> ViewGraph:
-    with log.stage("view graph"):
-        read = replace(options.read, random_seed=options.random_seed)
-        if not options.ba_refine_focal_length:
-            # Focal lengths that bundle adjustment must not refine are not changed here either.
-            read = replace(read, trust_focal_lengths="always")
-        if not options.ba_refine_extra_params:
-            read = replace(read, find_distortion=False)
-        graph, caveats = read_with_caveats(database_path, read, given)
-        if given is not None:
-            check_image_names(given, graph.image_names)
-        for caveat in caveats:
-            log.warn(caveat)
-        graph = replace(graph, priors=_wanted_priors(graph.priors, options))
-        log.result(f"{graph.num_images} images, {graph.num_edges} pairs, {int(graph.has_rotation.sum())} usable")
-    return graph
-
-
-def _wanted_priors(priors: PosePriors | None, options: MappingOptions) -> PosePriors | None:
-    if priors is None:
-        return None
-    if not options.use_prior_position:
-        return priors.without_positions()
-    if options.overwrite_priors_covariance:
-        return priors.with_sigmas(
-            (options.prior_position_std_x, options.prior_position_std_y, options.prior_position_std_z)
-        )
-    return priors
-
-
-def _solve(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:
-    with log.stage("solve"):
-        solution = solve_view_graph(graph, _solve_options(options))
-        for caveat in solution.caveats:
-            log.warn(caveat)
-        log.result(solution.message)
-    return solution
-
-
-def _solve_options(options: MappingOptions) -> SolveOptions:
-    solve = replace(options.solve, random_seed=options.random_seed)
-    return solve if options.ba_refine_focal_length else replace(solve, refine_focal_lengths="never")
 
 
 def _with_database_cameras(

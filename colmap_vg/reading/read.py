@@ -20,7 +20,7 @@ from colmap_vg.reading.given_model import explained_pairs, of_pairs, with_given_
 from colmap_vg.reading.relative_poses import relative_poses
 from colmap_vg.reading.still_background import without_still_background
 from colmap_vg.reading.verification import with_verified_geometries
-from colmap_vg.scene.verdicts import EdgeVerdict
+from colmap_vg.scene.marked_pairs import with_marked_pairs
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.two_view.segments import evenly_thinned, segment_subset
 
@@ -100,14 +100,8 @@ def _graph(
         tables, focals.scales, focals.known, offsets, bearings1, bearings2, options.min_num_inliers
     )
     num_inliers = np.diff(offsets)
-    excluded = listed_edges(options.excluded_pairs_path, tables.image_names, tables.pairs)
-    trusted = listed_edges(options.trusted_pairs_path, tables.image_names, tables.pairs) & ~excluded
-    # A trusted pair is used even if nothing confirms its fundamental matrix.
-    doubted = trusted & (geometry.verdicts == EdgeVerdict.UNCALIBRATED)
-    verdicts = np.where(excluded, str(EdgeVerdict.EXCLUDED), geometry.verdicts)
-    verdicts = np.where(doubted, str(EdgeVerdict.KEPT), verdicts)
     thin = evenly_thinned(offsets, options.max_num_inliers_per_edge)
-    return ViewGraph(
+    graph = ViewGraph(
         image_ids=tables.image_ids,
         edges=tables.pairs,
         cam2_from_cam1_rotations=geometry.rotations,
@@ -119,8 +113,7 @@ def _graph(
         camera_focal_lengths=np.array([focal_length(c) for c in cameras]),
         camera_focal_known=focals.known,
         camera_radial=np.array([has_radial_term(c) for c in cameras], dtype=bool),
-        read_verdicts=verdicts,
-        trusted=trusted if trusted.any() else None,
+        read_verdicts=geometry.verdicts,
         found_radial_terms=terms if terms.any() else None,
         verified_anew=changed if changed.any() else None,
         planar=geometry.planar,
@@ -132,6 +125,8 @@ def _graph(
         inlier_keypoints1=matches[thin, 0].astype(np.int32),
         inlier_keypoints2=matches[thin, 1].astype(np.int32),
     )
+    listed = (options.excluded_pairs_path, options.trusted_pairs_path)
+    return with_marked_pairs(graph, *(listed_edges(path, tables.image_names, tables.pairs) for path in listed))
 
 
 def _rays_of_matches(

@@ -1,0 +1,80 @@
+"""Read and solve the viewing graph of a job with the options of its mapping."""
+
+from dataclasses import replace
+from os import PathLike
+
+import pycolmap
+
+from colmap_vg.events import StageLog
+from colmap_vg.mapping.extension import check_image_names
+from colmap_vg.options import MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.reading.read import read_with_caveats
+from colmap_vg.scene.pose_priors import PosePriors
+from colmap_vg.scene.solution import PoseSolution
+from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.solver.solve import solve_view_graph
+
+
+def read_job_graph(
+    database_path: str | PathLike[str],
+    options: MappingOptions,
+    log: StageLog,
+    given: "pycolmap.Reconstruction | None" = None,
+) -> ViewGraph:
+    """Read the viewing graph as a stage, with the measured positions that the options want.
+
+    Parameters
+    ----------
+    database_path : path
+    options : MappingOptions
+    log : StageLog
+    given : pycolmap.Reconstruction, optional
+        Model to start from; the database must have all its images.
+    """
+    with log.stage("view graph"):
+        graph, caveats = read_with_caveats(database_path, read_options(options), given)
+        if given is not None:
+            check_image_names(given, graph.image_names)
+        for caveat in caveats:
+            log.warn(caveat)
+        graph = replace(graph, priors=_wanted_priors(graph.priors, options))
+        log.result(f"{graph.num_images} images, {graph.num_edges} pairs, {int(graph.has_rotation.sum())} usable")
+    return graph
+
+
+def read_options(options: MappingOptions) -> ReadOptions:
+    """Options of reading; what bundle adjustment must not refine is not changed on reading either."""
+    read = replace(options.read, random_seed=options.random_seed)
+    if not options.ba_refine_focal_length:
+        read = replace(read, trust_focal_lengths="always")
+    if not options.ba_refine_extra_params:
+        read = replace(read, find_distortion=False)
+    return read
+
+
+def _wanted_priors(priors: PosePriors | None, options: MappingOptions) -> PosePriors | None:
+    if priors is None:
+        return None
+    if not options.use_prior_position:
+        return priors.without_positions()
+    if options.overwrite_priors_covariance:
+        return priors.with_sigmas(
+            (options.prior_position_std_x, options.prior_position_std_y, options.prior_position_std_z)
+        )
+    return priors
+
+
+def solve_job_graph(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:
+    """Solve the viewing graph as a stage."""
+    with log.stage("solve"):
+        solution = solve_view_graph(graph, solve_options(options))
+        for caveat in solution.caveats:
+            log.warn(caveat)
+        log.result(solution.message)
+    return solution
+
+
+def solve_options(options: MappingOptions) -> SolveOptions:
+    """Options of solving, with the seed of the job; focal lengths are fixed where bundle adjustment must not refine them."""
+    solve = replace(options.solve, random_seed=options.random_seed)
+    return solve if options.ba_refine_focal_length else replace(solve, refine_focal_lengths="never")
