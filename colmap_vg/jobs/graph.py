@@ -75,6 +75,6 @@ def solve_job_graph(graph: ViewGraph, options: MappingOptions, log: StageLog) ->
 
 
 def solve_options(options: MappingOptions) -> SolveOptions:
-    """Options of solving, with the seed of the job; focal lengths are fixed where bundle adjustment must not refine them."""
+    """Options of solving; focal lengths that bundle adjustment must not refine are fixed here, too."""
     solve = replace(options.solve, random_seed=options.random_seed)
     return solve if options.ba_refine_focal_length else replace(solve, refine_focal_lengths="never")

@@ -47,4 +47,4 @@ def _made(kind: type[Options], recorded: Mapping[str, Any]) -> Options:
     unknown = sorted(set(recorded) - known)
     if unknown:
         raise OptionError(f"{kind.__name__} has no option {unknown[0]}")
-    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in recorded.items()})
+    return kind(**recorded)
