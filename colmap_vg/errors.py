@@ -31,3 +31,7 @@ class OutputError(ColmapVgError):
 
 class MappingError(ColmapVgError):
     """No model could be made from the data."""
+
+
+class ViewerError(ColmapVgError):
+    """The explorer cannot be started."""

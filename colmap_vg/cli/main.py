@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,14 @@ from colmap_vg.options import ExportFormat
 
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of wrong usage, and of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
+
+
+class Backend(StrEnum):
+    """What the explorer is shown by."""
+
+    VISER = "viser"
+    OPEN3D = "open3d"
+
 
 app = typer.Typer(
     name="colmap-vg",
@@ -227,6 +236,35 @@ def report(
         import colmap_vg.cli.jobs as jobs
 
         jobs.report(output_path, image_path, database_path, reporter)
+
+
+@app.command()
+def view(
+    output_path: Annotated[Path, typer.Option("--output_path", help="Folder of a finished job. It is not changed.")],
+    image_path: Annotated[
+        Path | None, typer.Option("--image_path", help="Folder of the photographs. Default: that of the job.")
+    ] = None,
+    database_path: Annotated[
+        Path | None,
+        typer.Option("--database_path", help="The job's database, never modified. Default: that of the job."),
+    ] = None,
+    lists_path: Annotated[
+        Path | None,
+        typer.Option("--lists_path", help="Folder that lists of pairs are saved to. Default: OUT_lists beside OUT."),
+    ] = None,
+    backend: Annotated[
+        Backend, typer.Option("--backend", help="A page in the browser, or a window of Open3D, to look only.")
+    ] = Backend.VISER,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to listen on. Others than this machine's own open the job to others.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="First port that is tried. 0: any.")] = 8080,
+) -> None:
+    """Explore a finished job: exclude or trust pairs and images, solve again, and save the lists for mapper."""
+    with _job(False, False) as reporter:
+        from colmap_vg.cli.exploring import view
+
+        view(output_path, image_path, database_path, lists_path, backend, host, port, reporter)
 
 
 def main() -> None:

@@ -102,7 +102,7 @@ def model_view(name: str, model: "pycolmap.Reconstruction", rows: Mapping[str, i
     low, high = _box(xyz, centers)
     near = np.flatnonzero(((xyz >= low) & (xyz <= high)).all(axis=1))
     kept = near[np.linspace(0, len(near) - 1, max_points).astype(np.int64)] if len(near) > max_points else near
-    depth = _frustum_depth(centers, float(np.linalg.norm(high - low)))
+    depth = frustum_depth(centers, float(np.linalg.norm(high - low)))
     rays = np.array([_corner_rays(model.camera(image.camera_id)) for image in shown]).reshape(-1, 4, 3)
     corners = centers[:, None] + depth * np.einsum("nji,nkj->nki", axes, rays) @ turn.T
     limit = float(np.percentile(errors, 99)) if len(errors) else 1.0
@@ -163,7 +163,8 @@ def _box(xyz: Array, centers: Array) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-def _frustum_depth(centers: Array, diagonal: float) -> float:
+def frustum_depth(centers: Array, diagonal: float) -> float:
+    """Depth of the frusta of cameras (n, 3) in a scene with a diagonal."""
     if len(centers) < 2:
         return MAX_FRUSTUM_SHARE * diagonal
     from scipy.spatial import cKDTree

@@ -34,22 +34,45 @@ def thumbnails(folder: Path, names: Sequence[str], sides: Sequence[int]) -> list
         JPEG data URIs; empty where a photograph is missing or cannot be read.
     """
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(lambda name, side: _thumbnail(folder / name, side), names, sides))
+        return list(pool.map(lambda name, side: _thumbnail(folder, name, side), names, sides))
 
 
-def _thumbnail(path: Path, side: int) -> str:
+def photograph(folder: Path, name: str, side: int) -> NDArray[np.uint8] | None:
+    """Read a photograph as it is stored, at the smallest size that is decoded at once and not below `side`.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the photographs.
+    name : str
+        As in the database: one that leads out of the folder is not read.
+    side : int
+        Longer side, pixels.
+
+    Returns
+    -------
+    (h, w, 3) uint8 array or None
+        Red, green and blue; None where it is missing, cannot be read, or lies outside of the folder.
+    """
     try:
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except (OSError, ValueError):  # a name with a zero byte is a ValueError
+        # Links in the folder are the user's, and may lead anywhere; names are the database's.
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            return None
+        pixels = _decoded(np.frombuffer((folder / name).read_bytes(), dtype=np.uint8), side)
+    except (OSError, ValueError, cv2.error):  # a name with a zero byte is a ValueError
+        return None
+    return None if pixels is None else np.ascontiguousarray(pixels[:, :, ::-1])
+
+
+def _thumbnail(folder: Path, name: str, side: int) -> str:
+    pixels = photograph(folder, name, side)
+    if pixels is None:
         return ""
     try:
-        pixels = _decoded(data, side)
-        if pixels is None:
-            return ""
         scale = min(side / max(pixels.shape[:2]), 1.0)
         size = [max(round(scale * length), 1) for length in pixels.shape[1::-1]]
         small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-        written, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        written, encoded = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     except cv2.error:
         return ""
     return f"data:image/jpeg;base64,{b64encode(encoded.tobytes()).decode('ascii')}" if written else ""
