@@ -12,6 +12,7 @@ ABOVE_THE_NUMERICS = (
     "cli",
     "report",
     "exports",
+    "viewer",
     "demo",
     "jobs",
     "reading",
