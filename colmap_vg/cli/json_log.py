@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import stat
 import sys
 from contextlib import suppress
@@ -102,8 +101,6 @@ class JsonLog:
             self._stream.write(line + "\n")
             self._stream.flush()
         except OSError as error:
-            if self.to_stdout:  # what is left in its buffer would fail again when the process ends
-                sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  -- open until then
             raise _not_writable(self._target, error) from error
 
 
