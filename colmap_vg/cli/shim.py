@@ -59,7 +59,7 @@ def main() -> None:
         return
     name = "glomap" if Path(sys.argv[0]).name == "glomap" else "colmap"
     tried = [path for path in os.environ.get(TRIED, "").split(os.pathsep) if path]
-    program = real_program(name, Path(sys.argv[0]), tried)
+    program = real_program(name, tried)
     if program is not None:
         _hand_over(program, arguments, tried)
     if not arguments or arguments[0] in ("help", "-h", "--help"):
@@ -70,16 +70,14 @@ def main() -> None:
     _fail(f"{arguments[0]} is a command of {name}, and there is no {name} on PATH: {remedy}")
 
 
-def real_program(name: str, own: Path, tried: Sequence[str] = ()) -> str | None:
-    """Find the first program of a name on PATH that is not this one.
+def real_program(name: str, tried: Sequence[str] = ()) -> str | None:
+    """Find the first program of a name on PATH that was not tried yet.
 
     Parameters
     ----------
     name : str
-    own : Path
-        File of this program; links to it are passed over.
     tried : sequence of str
-        Files that are passed over, too.
+        Files that are passed over: they turned out to call this program.
 
     Returns
     -------
@@ -87,9 +85,8 @@ def real_program(name: str, own: Path, tried: Sequence[str] = ()) -> str | None:
     """
     for folder in os.get_exec_path():
         found = shutil.which(name, path=folder)
-        if found is None or found in tried or Path(found).resolve() == own.resolve():
-            continue
-        return found
+        if found is not None and found not in tried:
+            return found
     return None
 
 
