@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from colmap_vg._version import __version__
 
 _HOME = {
+    "CancelledError": "errors",
     "ColmapVgError": "errors",
     "EdgeVerdict": "scene.verdicts",
     "FeatureOptions": "options",
@@ -36,7 +37,7 @@ _HOME = {
 if TYPE_CHECKING:
     from colmap_vg.datasets.bundle import read_bundle
     from colmap_vg.datasets.one_dsfm_folder import read_1dsfm
-    from colmap_vg.errors import ColmapVgError
+    from colmap_vg.errors import CancelledError, ColmapVgError
     from colmap_vg.exports.export import export_model
     from colmap_vg.geometry.similarity import Similarity, align_positions
     from colmap_vg.jobs.image_folder import image_folder_mapping
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from colmap_vg.solver.solve import solve_view_graph
 
 __all__ = [
+    "CancelledError",
     "ColmapVgError",
     "EdgeVerdict",
     "FeatureOptions",

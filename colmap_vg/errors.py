@@ -5,6 +5,13 @@ class ColmapVgError(Exception):
     """Base class of all errors that users can cause; the command line prints it on one line and exits with 1."""
 
 
+class CancelledError(Exception):
+    """A job was cancelled: raised by a caller's ``on_event``, which stops the job, and passed on to the caller.
+
+    No `ColmapVgError`: nothing is wrong with the data, and who handles those errors need not handle this one.
+    """
+
+
 class OptionError(ColmapVgError, ValueError):
     """An option is out of its range, or options contradict each other."""
 

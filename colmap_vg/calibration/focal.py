@@ -19,6 +19,7 @@ from colmap_vg.calibration.focal_curves import (
     curves_of_one_camera,
     focal_curves,
 )
+from colmap_vg.events import report_progress
 from colmap_vg.linear.assembly import sum_at_nodes
 
 Array = NDArray[np.float64]
@@ -199,6 +200,7 @@ def _vote(
     several = bool((sides.cameras[:, 0] != sides.cameras[:, 1]).any())
     sigmas = np.full(c, np.inf)
     for _ in range(num_sweeps if several else 1):
+        report_progress("focal lengths")
         best, sigmas = _minimized(sides, log_focals)
         # Pairs of two cameras determine mostly the product of their focals: full steps of both would overshoot.
         step = np.where(np.isfinite(sigmas), best - log_focals, 0.0) * (0.6 if several else 1.0)

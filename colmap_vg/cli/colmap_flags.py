@@ -1,4 +1,4 @@
-"""The flags of ``colmap mapper``, ``colmap global_mapper`` and ``glomap mapper``: obeyed, known, or unknown.
+"""The flags of COLMAP's mappers and of ``glomap mapper``: obeyed, known, or unknown.
 
 Scripts written for those mappers keep working: what has a counterpart here is obeyed, what has none is named in a
 warning, and what none of them knows is an error. Names are those of COLMAP 3.8 to 4.2 and GLOMAP 1.0 to 1.2.
@@ -49,6 +49,7 @@ _IGNORED = {
         skip_preprocessing skip_view_graph_calibration skip_relative_pose_estimation skip_rotation_averaging
         skip_track_establishment skip_global_positioning skip_bundle_adjustment skip_retriangulation skip_pruning
         use_robust_loss_on_prior_position prior_position_loss_scale
+        num_workers image_overlap leaf_max_num_images
         """,
     "Mapper.": """
         ignore_watermarks multiple_models max_num_models max_model_overlap min_model_size init_image_id1 init_image_id2

@@ -301,6 +301,14 @@ class JobFlags:
     ] = False
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print every event and COLMAP's own log.")] = False
+    log_json: Annotated[
+        str | None,
+        typer.Option(
+            "--log_json",
+            metavar="FILE|-",
+            help="Write each event as a line of JSON, and last the result. -: to standard output, in place of text.",
+        ),
+    ] = None
 
     @property
     def seed(self) -> int:

@@ -14,14 +14,16 @@ from colmap_vg.jobs.bridges import all_bridges
 from colmap_vg.jobs.image_folder import DATABASE_NAME, make_database
 from colmap_vg.jobs.job_record import recorded_job
 from colmap_vg.jobs.mapper import MappingResult, map_database
-from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
+from colmap_vg.jobs.output_folder import existing_models, publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.jobs.summary import (
+    damaged_summary,
     edge_summary,
     georeference_line,
     image_summary,
     job_summary,
     model_summary,
     plain,
+    read_summary,
     told_bridges,
     write_summary,
 )
@@ -64,7 +66,7 @@ def run(
     asked = {"image_path": image_path, "output_path": output_path, "features": features, "mapping": options}
     with recorded_job(output_path, "run", asked, image_path, overwrite=options.overwrite, resume=resume) as job:
         if job.finished:
-            reporter.say(DONE_BEFORE.format(output_path))
+            _done_before(output_path, reporter)
             return
         options = replace(options, overwrite=job.overwrite)
         result = make_database(image_path, output_path, features, log, overwrite=options.overwrite, resume=resume)
@@ -90,7 +92,7 @@ def mapper(
         asked["input_path"] = input_path
     with recorded_job(output_path, "mapper", asked, database_path, overwrite=options.overwrite, resume=resume) as job:
         if job.finished:
-            reporter.say(DONE_BEFORE.format(output_path))
+            _done_before(output_path, reporter)
             return
         options = replace(options, overwrite=job.overwrite)
         log = StageLog(reporter.on_event)
@@ -112,7 +114,7 @@ def solve(
     asked = {"database_path": database_path, "output_path": output_path, "read": read, "solve": options}
     with recorded_job(output_path, "solve", asked, database_path, overwrite=overwrite, resume=resume) as job:
         if job.finished:
-            reporter.say(DONE_BEFORE.format(output_path))
+            _done_before(output_path, reporter)
             return
         _solve(
             database_path,
@@ -165,6 +167,7 @@ def _solve(
     content |= _verdicts(graph, solution, output_path, {})
     write_summary(output_path, content)
     names = image_names(graph)
+    reporter.finish(len(staged), int((solution.component >= 0).sum()))
     reporter.say(f"{int(solution.registered.sum())} of {len(names)} images registered: {output_path / '0'}")
 
 
@@ -185,7 +188,7 @@ def demo(
     asked = {"output_path": output_path, "num_images": num_images, "seed": seed, "num_threads": num_threads}
     with recorded_job(output_path, "demo", asked, None, overwrite=overwrite, resume=resume) as job:
         if job.finished:
-            reporter.say(DONE_BEFORE.format(output_path))
+            _done_before(output_path, reporter)
             return
         comparison, mapped = run_demo(
             output_path,
@@ -294,10 +297,21 @@ def _finish(
     ]
     content |= further or {}
     write_summary(output_path, content)
+    reporter.finish(len(mapped.models), int((mapped.solution.component >= 0).sum()))
     for line in closing_lines(content, output_path):
         reporter.say(line)
     if with_report:
         _report(output_path, content, reporter)
+
+
+def _done_before(output_path: Path, reporter: Reporter) -> None:
+    """Say that the job came to its end before, and with what."""
+    try:
+        registered = int(read_summary(output_path)["images"]["num_registered"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise damaged_summary(output_path) from error
+    reporter.finish(len([path for path in existing_models(output_path) if path != output_path]), registered)
+    reporter.say(DONE_BEFORE.format(output_path))
 
 
 def _report(output_path: Path, content: Mapping[str, object], reporter: Reporter) -> None:

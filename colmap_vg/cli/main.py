@@ -13,13 +13,11 @@ import typer
 from colmap_vg._version import __version__
 from colmap_vg.cli import colmap_flags, flags
 from colmap_vg.cli.flags import takes_flags
+from colmap_vg.cli.json_log import FAILED, INTERRUPTED, USAGE, JsonLog
 from colmap_vg.cli.reporter import Reporter
-from colmap_vg.cli.wording import with_flags
+from colmap_vg.cli.wording import one_line
 from colmap_vg.errors import ColmapVgError, OptionError
 from colmap_vg.options import ExportFormat
-
-USAGE, INTERRUPTED = 2, 130
-"""Exit codes of wrong usage, and of a job ended by Ctrl-C, as shells give it (128 + SIGINT)."""
 
 
 class Backend(StrEnum):
@@ -64,7 +62,7 @@ def run(
     job: flags.JobFlags,
 ) -> None:
     """From a folder of photographs to models: features, matching, viewing graph, triangulation, bundle adjustment."""
-    with _job(job.quiet, job.verbose) as reporter:
+    with _job(job.quiet, job.verbose, job.log_json) as reporter:
         feature_options, options = flags.feature_options(features, job), flags.mapping_options(read, solve, job, model)
         import colmap_vg.cli.jobs as jobs
 
@@ -98,7 +96,7 @@ def mapper(
         ignored = colmap_flags.ignored_flags(context.args)
     except colmap_flags.UnknownArgumentError as error:
         raise typer.BadParameter(str(error)) from None
-    with _job(job.quiet, job.verbose) as reporter:
+    with _job(job.quiet, job.verbose, job.log_json) as reporter:
         options = flags.mapping_options(read, solve, job, model)
         for flag in ignored:
             reporter.warn(f"{flag} has no counterpart in colmap-vg and is ignored")
@@ -117,7 +115,7 @@ def solve(
     job: flags.JobFlags,
 ) -> None:
     """The viewing graph only: OUT/0 holds poses without points."""
-    with _job(job.quiet, job.verbose) as reporter:
+    with _job(job.quiet, job.verbose, job.log_json) as reporter:
         options = flags.mapping_options(read, solve, job)
         import colmap_vg.cli.jobs as jobs
 
@@ -134,7 +132,7 @@ def demo(
     job: flags.JobFlags,
 ) -> None:
     """Render photographs of a scene from known cameras, make a model of them, and compare it with the truth."""
-    with _job(job.quiet, job.verbose) as reporter:
+    with _job(job.quiet, job.verbose, job.log_json) as reporter:
         import colmap_vg.cli.jobs as jobs
 
         jobs.demo(output_path, num_images, job.seed, job.num_threads, job.overwrite, job.resume, reporter, report)
@@ -153,7 +151,7 @@ def explain(
     """Say what a finished job made of its images and pairs, and why."""
     if image is not None and pair is not None:
         raise typer.BadParameter("--image and --pair are two questions: ask one")
-    with _job(False, False) as reporter:
+    with _job() as reporter:
         import colmap_vg.cli.jobs as jobs
 
         for line in jobs.explain(output_path, image, pair):
@@ -180,7 +178,7 @@ def align(
     """Move a model into the frame of known camera positions or survey points: OUT/0."""
     if (ref_images_path is None) == (ref_points_path is None):
         raise typer.BadParameter("give either --ref_images_path or --ref_points_path")
-    with _job(False, False) as reporter:
+    with _job() as reporter:
         import colmap_vg.cli.jobs as jobs
 
         jobs.align(input_path, output_path, ref_images_path, ref_points_path, ref_is_gps, overwrite, reporter)
@@ -232,7 +230,7 @@ def report(
     ] = None,
 ) -> None:
     """Write OUT/report.html: a page to look at the result of a finished job, without a network."""
-    with _job(False, False) as reporter:
+    with _job() as reporter:
         import colmap_vg.cli.jobs as jobs
 
         jobs.report(output_path, image_path, database_path, reporter)
@@ -280,22 +278,22 @@ def main() -> None:
 
 
 @contextmanager
-def _job(quiet: bool, verbose: bool) -> Iterator[Reporter]:
+def _job(quiet: bool = False, verbose: bool = False, log_json: str | None = None) -> Iterator[Reporter]:
     """A reporter for the job, whose expected ends become exit codes with one line on standard error."""
     if quiet and verbose:
         raise typer.BadParameter("--quiet and --verbose contradict each other")
     try:
-        with Reporter(quiet, verbose) as reporter:
-            yield reporter
+        if log_json is None:
+            with Reporter(quiet, verbose) as reporter:
+                yield reporter
+        else:
+            with JsonLog(log_json) as log, Reporter(quiet or log.to_stdout, verbose, log) as reporter:
+                yield reporter
     except OptionError as error:
-        raise typer.BadParameter(_one_line(error)) from error
+        raise typer.BadParameter(one_line(error)) from error
     except ColmapVgError as error:
-        typer.echo(f"error: {_one_line(error)}", err=True)
-        raise typer.Exit(1) from error
+        typer.echo(f"error: {one_line(error)}", err=True)
+        raise typer.Exit(FAILED) from error
     except KeyboardInterrupt:
         typer.echo("interrupted; finished stages are kept: go on with --resume", err=True)
         raise typer.Exit(INTERRUPTED) from None
-
-
-def _one_line(error: BaseException) -> str:
-    return with_flags(" ".join(str(error).split()))

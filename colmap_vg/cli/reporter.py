@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from colmap_vg.cli.json_log import JobResult, JsonLog
 from colmap_vg.events import StageEvent, StageRecord, peak_memory_mib
 
 if TYPE_CHECKING:
@@ -27,10 +28,13 @@ class Reporter:
         Show nothing; stages and warnings are remembered all the same.
     verbose : bool
         Show every event.
+    json_log : JsonLog, optional
+        Receives every event, too, whatever is shown.
     """
 
     quiet: bool = False
     verbose: bool = False
+    json_log: JsonLog | None = None
     records: list[StageRecord] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     _progress: "Progress | None" = None
@@ -62,8 +66,10 @@ class Reporter:
 
     def on_event(self, event: StageEvent) -> None:
         """Take one event of the job."""
+        if self.json_log is not None:
+            self.json_log.event(event)
         if event.state == "warning":
-            self.warn(event.message)
+            self._warn(event.message)
         elif event.state == "finished":
             self.records.append(StageRecord(event.stage, event.seconds, peak_memory_mib(), event.message))
             self._clear_task()
@@ -77,7 +83,17 @@ class Reporter:
             self._advance(event)
 
     def warn(self, message: str) -> None:
-        """Show a caveat and keep it for the summary."""
+        """Show a caveat that belongs to no stage and keep it for the summary."""
+        if self.json_log is not None:
+            self.json_log.event(StageEvent("", "warning", message))
+        self._warn(message)
+
+    def finish(self, models: int, registered: int) -> None:
+        """Take the number of models and of images in them for the log's last line."""
+        if self.json_log is not None:
+            self.json_log.result = JobResult(models, registered)
+
+    def _warn(self, message: str) -> None:
         self.warnings.append(message)
         self.say(f"warning: {message}")
 

@@ -28,5 +28,10 @@ def with_flags(message: str) -> str:
     return _WORD.sub(lambda found: _word(found[0]), message)
 
 
+def one_line(error: BaseException) -> str:
+    """The message of an error on one line, with options as flags."""
+    return with_flags(" ".join(str(error).split()))
+
+
 def _word(name: str) -> str:
     return f"--{name}" if name in _OPTIONS else _VERBS.get(name, name)

@@ -22,6 +22,7 @@ from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.errors import GraphError
+from colmap_vg.events import report_progress
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.linear.robust_losses import MAD_TO_SIGMA
@@ -394,6 +395,7 @@ def _minimized(
     terms = _terms(problem, cameras, scale, near=near)
     before = _total(terms)
     for iteration in range(max_num_iterations):
+        report_progress("epipolar adjustment")
         gradient, reach, ahead = system.gradient(terms), cameras.reach(problem.edges), None
         for attempt in count():
             step = system.step(terms, gradient, damping)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.epipolar.depth_agreement import TripletRays
 from colmap_vg.epipolar.triplets import Triplets, find_triplets
+from colmap_vg.events import report_progress
 from colmap_vg.options import SolveOptions
 from colmap_vg.scene.subgraph import Subgraph
 from colmap_vg.scene.view_graph import ViewGraph
@@ -163,8 +164,10 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
             graph.cam2_from_cam1_rotations[part.edge_rows],
         )
     # Triplets are formed from all matches: subsampled pairs share few tracks.
+    report_progress("tracks")
     spread = well_spread(part_offsets, rays1[rows], options.max_matches_per_edge)
     rows, part_offsets = rows[spread], segment_subset(part_offsets, spread)
+    report_progress("tracks")
     camera_idx = group[camera_idx[part.images]]
     seen = np.isin(np.arange(len(of_group)), camera_idx)
     focals, free = focals[of_group], refined[of_group] & seen

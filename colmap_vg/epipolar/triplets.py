@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 
+from colmap_vg.events import report_progress
 from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_of_rows, segment_subset, segment_sums
 
@@ -106,16 +107,21 @@ def find_triplets(
     turned = np.einsum("kab,kb->ka", relative_rotations[segment_of_rows(offsets)], bearings1)
     sine = np.linalg.norm(np.cross(turned, bearings2), axis=1)
     # Half-edges at the first images, then those at the second ones; rows of matches in the same order.
+    report_progress("tracks")
     middle, other = edges.T.ravel(), edges[:, ::-1].T.ravel()
     half_offsets = np.concatenate([offsets, offsets[1:] + k])
     keypoints = np.concatenate([keypoints1, keypoints2]).astype(np.int64)
     chosen = _best_of_each(middle, segment_sums(half_offsets, np.tile(np.square(sine), 2)), HALF_EDGES_PER_IMAGE)
+    report_progress("tracks")
     pairs = _select_pairs(middle[chosen], other[chosen], half_offsets, keypoints, np.tile(sine, 2), chosen, m)
+    report_progress("tracks")
     first, second = _join(pairs, half_offsets, keypoints)
     shared = np.concatenate([[0], np.cumsum(np.bincount(first[0], minlength=len(pairs)))]).astype(np.int64)
+    report_progress("tracks")
     kept = evenly_thinned(shared, TRACKS_PER_TRIPLET)
     of_other, of_middle = np.concatenate([bearings2, bearings1]), np.concatenate([bearings1, bearings2])
     in_other = np.concatenate([keypoints2, keypoints1]).astype(np.int64)
+    report_progress("tracks")
     rows_a, rows_c = first[1][kept], second[kept]
     return Triplets(
         np.stack([other[pairs[:, 0]], middle[pairs[:, 0]], other[pairs[:, 1]]], axis=1),

@@ -93,7 +93,8 @@ def view_graph_mapping(
         Models are written to ``output_path/0``, ``output_path/1``, ..., each atomically.
     options : MappingOptions, optional
     on_event : callable, optional
-        Called with a `StageEvent` whenever a stage starts, progresses, ends or warns.
+        Called with a `StageEvent` whenever a stage starts, progresses, ends or warns. An exception from it stops the
+        job, which then writes no model, and is passed on.
     input_path : path, optional
         Folder of a model of some of the images, which the others are added to, in its frame.
 
@@ -112,6 +113,8 @@ def view_graph_mapping(
         No model could be made.
     OptionError
         `options` is not a `MappingOptions`.
+    CancelledError
+        Or what else `on_event` raises.
     """
     options = MappingOptions.given(options)
     with quiet_colmap():
@@ -163,6 +166,7 @@ def map_database(
                 if options.extract_colors:
                     extract_colors(model.reconstruction, image_path, log)
                 write_model(model.reconstruction, folder)
+                log.progress(str(folder.name))
             published = publish_models(staged, output_path)
             log.result(", ".join(map(str, published)))
     models = {index: model.reconstruction for index, model in enumerate(built)}

@@ -63,9 +63,17 @@ def prepare_output(output_path: str | PathLike[str], overwrite: bool = False) ->
 
 @contextmanager
 def work_folder(output_path: str | PathLike[str], overwrite: bool = False) -> Iterator[Path]:
-    """Lock an output folder and prepare it, as :func:`output_lock` and :func:`prepare_output` do."""
+    """Lock an output folder and prepare it, as :func:`output_lock` and :func:`prepare_output` do.
+
+    When the job fails or is cancelled, models that were not published yet are removed.
+    """
     with output_lock(output_path):
-        yield prepare_output(output_path, overwrite)
+        work = prepare_output(output_path, overwrite)
+        try:
+            yield work
+        except BaseException:
+            shutil.rmtree(work / STAGE_NAME, ignore_errors=True)
+            raise
 
 
 @contextmanager

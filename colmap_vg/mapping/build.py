@@ -13,7 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import focal_length
-from colmap_vg.events import StageLog
+from colmap_vg.events import StageLog, report_progress
 from colmap_vg.mapping.bundle import Held, adjust_bundle, held_of
 from colmap_vg.mapping.lenses import reset_diverged_lenses
 from colmap_vg.mapping.options import (
@@ -180,7 +180,9 @@ def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: Mappin
     cost_ratio, enough = _adjust(mapper, options, held), GOOD_START_COST_RATIO
     for _ in range(MAX_NUM_ROUNDS):
         before, lenses = lenses, _focal_lengths(mapper.reconstruction)
+        report_progress("tracks")
         mapper.complete_and_merge_tracks(triangulator)
+        report_progress("tracks")
         mapper.retriangulate(triangulator)
         _filter(mapper)
         if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
@@ -262,6 +264,7 @@ def _adjust(
     priors: Sequence["pycolmap.PosePrior"] = (),
 ) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
+    report_progress("bundle adjustment")
     cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial, priors=priors, held=held)
     _filter(mapper)
     return cost_ratio
@@ -302,6 +305,7 @@ def _register_left_out(
     while True:
         candidates = [i for i in mapper.find_next_images(registration, False) if i not in never]
         for image_id in candidates:
+            report_progress("images that are left")
             if mapper.register_next_image(registration, image_id):
                 together = _images_of(mapper.reconstruction, mapper.reconstruction.image(image_id).frame_id)
                 for each in sorted(together):

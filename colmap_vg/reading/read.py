@@ -12,6 +12,7 @@ from colmap_vg.colmap_io.pair_lists import listed_edges
 from colmap_vg.colmap_io.pose_priors import read_pose_priors
 from colmap_vg.colmap_io.rigs import read_rigs
 from colmap_vg.colmap_io.tables import DatabaseTables, read_tables
+from colmap_vg.events import report_progress
 from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
 from colmap_vg.reading.distortion import with_found_distortion
@@ -80,14 +81,19 @@ def _read(
     tables: DatabaseTables, database_path: str | PathLike[str], options: ReadOptions, calibrated: BoolArray
 ) -> tuple[ViewGraph, tuple[str, ...]]:
     """Graph of the pairs of the tables; marked cameras (c,) keep their calibration."""
+    report_progress("distortion")
     terms = np.zeros(len(tables.cameras))
     if options.find_distortion:
         tables, terms = with_found_distortion(tables, database_path, calibrated)
+    report_progress("still background")
     tables, thinned = without_still_background(tables, database_path)
+    report_progress("verification")
     expected = thinned | (terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1)
     tables, changed = with_verified_geometries(tables, options.random_seed, expected)
     changed |= thinned
+    report_progress("focal lengths")
     focals = decide_focal_lengths(tables, options, calibrated)
+    report_progress("relative poses")
     return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
 
 
@@ -96,9 +102,11 @@ def _graph(
 ) -> ViewGraph:
     cameras = [with_focal_scale(c, s) for c, s in zip(tables.cameras, focals.scales, strict=True)]
     offsets, matches, bearings1, bearings2 = _rays_of_matches(tables, cameras)
+    report_progress("relative poses")
     geometry = relative_poses(
         tables, focals.scales, focals.known, offsets, bearings1, bearings2, options.min_num_inliers
     )
+    report_progress("relative poses")
     num_inliers = np.diff(offsets)
     thin = evenly_thinned(offsets, options.max_num_inliers_per_edge)
     graph = ViewGraph(
@@ -136,11 +144,13 @@ def _rays_of_matches(
     starts = np.concatenate([[0], np.cumsum([len(k) for k in tables.keypoints])]).astype(np.int64)
     rays, valid = np.zeros((int(starts[-1]), 3)), np.zeros(int(starts[-1]), dtype=bool)
     for camera_row, camera in enumerate(cameras):
+        report_progress("rays")
         images = np.flatnonzero(tables.camera_idx == camera_row)
         points = np.concatenate([np.zeros((0, 2))] + [tables.keypoints[i] for i in images])
         found, good = bearings_of_keypoints(camera, points)
         rows = np.concatenate([np.zeros(0, dtype=np.int64)] + [np.arange(starts[i], starts[i + 1]) for i in images])
         rays[rows], valid[rows] = found, good
+    report_progress("rays")
     image = np.repeat(tables.pairs, np.diff(tables.offsets), axis=0)
     rows = starts[image] + tables.matches
     keep = np.asarray(valid[rows].all(axis=1))

@@ -20,6 +20,7 @@ from colmap_vg.colmap_io.tables import (
     WATERMARK,
     DatabaseTables,
 )
+from colmap_vg.events import report_progress
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.two_view.edge_information import refine_relative_poses
@@ -125,6 +126,7 @@ class _Matches:
         return segment_sums(self.offsets, within.astype(np.float64)) / np.maximum(np.diff(self.offsets), 1)
 
     def judged(self, rotations: Array, directions: Array) -> RelativePoses:
+        report_progress("relative poses")
         return check_cheirality(rotations, directions, self.offsets, self.bearings1, self.bearings2)
 
     def of(self, pairs: IntArray) -> "_Matches":
@@ -132,6 +134,7 @@ class _Matches:
         return _Matches(offsets, self.bearings1[rows], self.bearings2[rows])
 
     def thinned(self, limit: int) -> "_Matches":
+        report_progress("relative poses")
         thin = evenly_thinned(self.offsets, limit)
         return _Matches(segment_subset(self.offsets, thin), self.bearings1[thin], self.bearings2[thin])
 

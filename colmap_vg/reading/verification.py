@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.cameras import calibration_matrix
 from colmap_vg.colmap_io.tables import CALIBRATED, DEGENERATE, UNCALIBRATED, UNDEFINED, WATERMARK, DatabaseTables
 from colmap_vg.colmap_io.undistortion import undistorted_keypoints
+from colmap_vg.events import report_progress
 from colmap_vg.geometry import so3
 from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
 from colmap_vg.two_view.sampson_errors import pixel_sampson_errors
@@ -125,6 +126,7 @@ def _explained(tables: DatabaseTables, pixels: tuple[Array, ...]) -> BoolArray:
     for points in pixels:
         epipolar = ((matrix, pixel_sampson_errors) for matrix in (tables.F, of_E, of_pose))
         for matrix, distance in (*epipolar, (tables.H, transfers)):
+            report_progress("verification")
             far = np.abs(distance(matrix, offsets, points[first], points[second]))
             explained |= segment_quantiles(offsets, np.nan_to_num(far, nan=FAR, posinf=FAR)) <= MAX_ERROR_PX
     return explained
@@ -148,7 +150,8 @@ def _verified(tables: DatabaseTables, pairs: IntArray, seed: int) -> DatabaseTab
     pixels, valid = undistorted_keypoints(tables)
     starts = np.concatenate([[0], np.cumsum([len(k) for k in tables.keypoints])])
     pinholes = [_pinhole(lens) for lens in tables.cameras]
-    for pair in pairs.tolist():
+    for count, pair in enumerate(pairs.tolist()):
+        report_progress(f"{count} of {len(pairs)} pairs verified")
         images = tables.pairs[pair].tolist()
         points = [pixels[starts[image] : starts[image + 1]] for image in images]
         seen = [valid[starts[image] : starts[image + 1]] for image in images]

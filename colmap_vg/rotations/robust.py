@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from colmap_vg.events import report_progress
 from colmap_vg.geometry import quaternions
 from colmap_vg.linear.laplacian import ReweightedLaplacian
 from colmap_vg.linear.robust_losses import geman_mcclure_weight
@@ -130,6 +131,7 @@ class _Reweighting:
     def run(self, loss: Loss, max_num_iterations: int, tolerance: float) -> bool:
         """Iterate until the root mean square step is below the tolerance; return whether it was reached."""
         for _ in range(max_num_iterations):
+            report_progress("rotations")
             self.step(loss, relative_tolerance=1e-2)
             if self.log[-1].change <= tolerance:
                 return True

@@ -8,6 +8,7 @@ if no other edge connects its clusters, so a false edge, however strong, is outv
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from colmap_vg.events import report_progress
 from colmap_vg.geometry import quaternions
 from colmap_vg.rotations.problem import checked_problem
 
@@ -55,6 +56,7 @@ def rotations_by_votes(
     voting = w > 0
     clusters = _Clusters(num_images, edges[voting], quaternions.from_matrices(relative[voting]), w[voting])
     for _ in range(num_images - 1):
+        report_progress("rotations")
         clusters.merge_best()
     return quaternions.to_matrices(clusters.absolute)
 

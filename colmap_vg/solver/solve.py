@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from colmap_vg.epipolar.problem import epipolar_problem
 from colmap_vg.errors import GraphError
+from colmap_vg.events import report_progress
 from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import SolveOptions
 from colmap_vg.scene.solution import PoseSolution
@@ -85,7 +86,9 @@ def _solve_part(
 ) -> tuple[Subgraph, PartPoses | None]:
     """Run all stages on a connected part; return the solved subgraph with poses, or the unsolvable part and None."""
     rotations, connected = average_rotations(state, part, options, initial)
+    report_progress("uncertain pairs")
     connected = admit_confirmed_pairs(state, connected, rotations, options)
+    report_progress("directions")
     fixed, centers = filter_directions(state, connected, rotations, options)
     if fixed.num_images < MIN_PART_IMAGES:
         return connected, None
@@ -93,11 +96,14 @@ def _solve_part(
     poses = PartPoses(own, np.zeros((fixed.num_images, 3)), np.ones(num_cameras(state.graph)))
     if options.method != "epipolar":
         return fixed, place_by_method(state, fixed, poses, options)
+    report_progress("tracks")
     problem = epipolar_problem(state.graph, fixed, options)
     if problem is None:
         fixed, poses = place_by_directions(state, fixed, poses, centers, options)
     else:
+        report_progress("positions")
         poses = place_by_lengths(state, fixed, problem, poses, options)
+        report_progress("epipolar adjustment")
         fixed, poses = adjust_poses(state, fixed, problem, poses, options)
     return (fixed, poses) if fixed.num_images >= MIN_PART_IMAGES else (connected, None)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.events import report_progress
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.linear.robust_losses import EFFICIENT_CAUCHY, MAD_TO_SIGMA
@@ -115,6 +116,7 @@ def _levenberg(
     damping = np.full(len(R), 1e-4)
     active = np.arange(len(R))
     for _ in range(num_iterations):
+        report_progress("relative poses")
         at_work = matches.of(active)
         at = normal_equations(at_work, R[active], d[active], scale[active])
         cost, gradient, hessian = at.costs, at.gradients, at.newton_hessians

@@ -50,6 +50,7 @@ OTHER_PROGRAMS_FLAGS = {
     "pytest": ("--benchmark-only",),
     "ruff": ("--check",),
     "sphinx-build": ("--keep-going",),
+    "ns-process-data": ("--colmap-cmd",),
     "colmap feature_extractor and matchers": (
         "--ImageReader.camera_model",
         "--ImageReader.camera_params",
