@@ -51,6 +51,7 @@ OTHER_PROGRAMS_FLAGS = {
     "ruff": ("--check",),
     "sphinx-build": ("--keep-going",),
     "ns-process-data": ("--colmap-cmd",),
+    "pip": ("--no-deps", "--force-reinstall"),
     "colmap feature_extractor and matchers": (
         "--ImageReader.camera_model",
         "--ImageReader.camera_params",
