@@ -50,7 +50,7 @@ OTHER_PROGRAMS_FLAGS = {
     "pytest": ("--benchmark-only",),
     "ruff": ("--check",),
     "sphinx-build": ("--keep-going",),
-    "ns-process-data": ("--colmap-cmd", "--sfm-tool", "--matching-method"),
+    "ns-process-data": ("--colmap-cmd", "--sfm-tool", "--matching-method", "--output-dir", "--data"),
     "pip": ("--no-deps", "--force-reinstall"),
     "colmap feature_extractor and matchers": (
         "--ImageReader.camera_model",
