@@ -71,7 +71,9 @@ def test_linked_components_have_true_poses(seed: int, backwards: bool, share_wro
     np.testing.assert_allclose(relative, R[NUM] @ R[NUM - 1].T, atol=1e-9)
 
 
-@pytest.mark.parametrize("fault", ["rotation", "direction", "reversed", "no positions", "uncertain", "dropped"])
+@pytest.mark.parametrize(
+    "fault", ["rotation", "direction", "reversed", "no positions", "uncertain", "dropped", "most wrong", "small"]
+)
 def test_nothing_is_linked_without_evidence(fault: str) -> None:
     graph, R, centers = scene(1)
     usable, link = all_edges(graph), graph.num_edges - 1
@@ -81,6 +83,14 @@ def test_nothing_is_linked_without_evidence(fault: str) -> None:
         graph.cam2_in_cam1_directions[link] = normalized(np.array([[0.1, 1.0, 0.3]]))[0]
     elif fault == "reversed":
         graph.cam2_in_cam1_directions[link] *= -1.0
+    elif fault == "most wrong":
+        off = np.array([0.0, 0.0, 30.0])  # whose effects cancel each other
+        graph.priors.positions[[NUM, NUM + 3]] += off
+        graph.priors.positions[[NUM + 1, NUM + 2]] -= off
+    elif fault == "small":  # the second component is as large as the positions are uncertain
+        near = graph.priors.positions[NUM].copy()
+        graph.priors.positions[NUM:] = near + 2e-3 * (graph.priors.positions[NUM:] - near)
+        centers[NUM:] = centers[NUM] + 2e-3 * (centers[NUM:] - centers[NUM])
     elif fault == "no positions":
         graph.priors.positions[NUM + 2 :] = np.nan
     elif fault == "uncertain":
@@ -104,3 +114,12 @@ def test_a_chain_is_solved_with_positions_and_not_without() -> None:
     assert align_positions(solution.projection_centers, centers)[0].max() < 5.0 * SIGMA
     assert any("their scale is that of the measured positions" in caveat for caveat in solution.caveats)
     assert solution.edge_kept.all()
+
+
+@pytest.mark.parametrize("verdict", ["excluded", "rotation_only", "no_pose"])
+def test_pairs_without_a_direction_link_nothing(verdict: str) -> None:
+    graph, _, _ = scene(2)
+    verdicts = np.full(graph.num_edges, "kept", dtype="<U20")
+    verdicts[-1] = verdict
+    solution = solve_view_graph(replace(graph, read_verdicts=verdicts), SolveOptions(method="2O"))
+    assert sorted(np.bincount(solution.component).tolist()) == [NUM, NUM]
