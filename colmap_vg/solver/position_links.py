@@ -79,19 +79,21 @@ def link_by_positions(
     order = np.argsort(-np.bincount(component[component >= 0]), kind="stable").tolist()
     for base in order:
         refused: set[int] = set()
-        while (measured := _measured(priors, centers, component == base)) is not None:
+        measured = _measured(priors, centers, component == base)
+        while measured is not None:
             pair, other = _strongest_pair(graph, usable, component, base, refused)
             if pair is None:
                 break
-            move = _link(graph, priors, measured, pair, rotations, centers, component == other)
+            theirs = component == other
+            move = _link(graph, priors, measured, pair, rotations, centers, theirs)
             if move is None:
                 refused.add(other)
                 continue
-            theirs = component == other
             rotations[theirs] = rotations[theirs] @ move.rotation.T
             centers[theirs] = move.apply(centers[theirs])
             component[theirs] = base
             refused.clear()
+            measured = _measured(priors, centers, component == base)
     return component
 
 

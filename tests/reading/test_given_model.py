@@ -123,3 +123,12 @@ def test_calibrations_are_those_of_the_model(database: Path, tmp_path: Path, pri
     assert graph.camera_focal_known.all()
     plain, _ = read_with_caveats(database, ReadOptions(trust_focal_lengths="always"))
     np.testing.assert_allclose(graph.cam2_from_cam1_rotations, plain.cam2_from_cam1_rotations, atol=0.03)
+
+
+def test_pairs_with_few_matches_are_not_used_even_if_they_agree(database: Path) -> None:
+    plain, _ = read_with_caveats(database, ReadOptions())
+    least = int(np.median(plain.num_inliers))
+    graph, _ = read_with_caveats(database, ReadOptions(min_num_inliers=least), model_of(VIEWS, database))
+    few = graph.num_inliers < least
+    assert (is_given(graph) & few).any()
+    assert (graph.read_verdicts[few] == "few_inliers").all()
