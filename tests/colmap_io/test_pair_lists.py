@@ -17,7 +17,7 @@ from colmap_vg import (
     solve_view_graph,
     view_graph_mapping,
 )
-from colmap_vg.colmap_io.pair_lists import listed_edges, read_pair_list
+from colmap_vg.colmap_io.pair_lists import listed_edges, pair_list, read_pair_list
 from colmap_vg.errors import DataFileError
 from colmap_vg.geometry import so3
 
@@ -91,3 +91,25 @@ def test_trusted_pairs_stay_whatever_contradicts_them(tmp_path: Path) -> None:
     for word, given in ((EdgeVerdict.ROTATION_OUTLIER, None), (EdgeVerdict.KEPT, trusted)):
         solution = solve_view_graph(replace(graph, cam2_from_cam1_rotations=wrong, trusted=given))
         assert solution.edge_verdicts[3] == word
+
+
+def test_written_lists_hold_any_name(tmp_path: Path) -> None:
+    names = [
+        "a.jpg",
+        "#b.jpg",
+        '["c.jpg"',
+        "d e.jpg",
+        "f\tg",
+        "h\ni",
+        " j ",
+        "k\r",
+        "ü 日本\u2028",
+        '"l"',
+        "a/b.jpg",
+        "\x00",
+    ]
+    pairs = [(one, other) for one in names for other in names if one != other]
+    path = tmp_path / "pairs.txt"
+    path.write_text(pair_list(pairs), encoding="utf-8", newline="")
+    assert read_pair_list(path) == pairs
+    assert pair_list([("a.jpg", "b/c.jpg")]) == "a.jpg\tb/c.jpg\n"  # as COLMAP's lists

@@ -112,6 +112,29 @@ def test_a_model_of_other_keypoints_gives_its_poses_only(scene: Path, tmp_path: 
     assert distances.max() < 1e-3 * radius(centers(joint, names))
 
 
+def test_ids_of_the_model_need_not_be_those_of_the_database(scene: Path, tmp_path: Path) -> None:
+    """Names are what counts, also for the tracks of its points."""
+    old = pycolmap.Reconstruction(scene / "old" / "0")
+    folder = tmp_path / "renumbered"
+    folder.mkdir()
+    old.write_text(folder)
+    for name in ("rigs.txt", "frames.txt"):
+        (folder / name).unlink()
+    lines = [line for line in (folder / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    heads = [line.split(" ", 1) for line in lines[::2]]
+    renumbered = [f"{int(number) + 100} {rest}" for number, rest in heads]
+    (folder / "images.txt").write_text("".join(f"{a}\n{b}\n" for a, b in zip(renumbered, lines[1::2], strict=True)))
+    points = [line.split() for line in (folder / "points3D.txt").read_text().splitlines() if not line.startswith("#")]
+    for words in points:
+        words[8::2] = [str(int(word) + 100) for word in words[8::2]]
+    (folder / "points3D.txt").write_text("".join(" ".join(words) + "\n" for words in points))
+    model = view_graph_mapping(scene / "all.db", None, tmp_path / "out", OPTIONS, input_path=folder)[0]
+    assert model.num_reg_images() == 25
+    assert model.num_points3D() > old.num_points3D()
+    assert model.compute_mean_reprojection_error() < 1.0
+    assert model.compute_mean_track_length() > old.compute_mean_track_length()
+
+
 def known_poses(folder: Path, views: SyntheticViews, sigma: float, names: range, width: int = WIDTH) -> Path:
     """A text model of poses only, turned by `sigma` radians and shifted by a third of the distance of neighbours."""
     rng = np.random.default_rng(0)

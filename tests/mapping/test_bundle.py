@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from colmap_vg.mapping import build, bundle
-from colmap_vg.mapping.bundle import adjust_bundle
+from colmap_vg.mapping.bundle import Held, adjust_bundle
 from colmap_vg.mapping.options import bundle_options
 from colmap_vg.options import MappingOptions
 
@@ -62,3 +62,27 @@ def test_one_more_round_is_a_trial_where_that_is_asked_for(trial: bool, monkeypa
         cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
     assert build.adjust_once_more(cache, model, ONE_THREAD, trial=trial) <= 1.0
     assert asked == [trial]
+
+
+def test_points_move_unless_held_frames_see_them_mostly() -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=6, num_points3D=120)
+    )
+    held_images = {1, 2, 3}
+    truth = {point_id: point.xyz.copy() for point_id, point in model.points3D.items()}
+    few, mostly, rng = [], [], np.random.default_rng(0)
+    for point_id in sorted(truth):
+        images = [3, 4, 5] if point_id % 2 else [1, 2, 4]
+        for element in list(model.point3D(point_id).track.elements):
+            if element.image_id not in images:
+                model.image(element.image_id).reset_point3D_for_point2D(element.point2D_idx)
+                model.point3D(point_id).track.delete_element(element.image_id, element.point2D_idx)
+        (few if point_id % 2 else mostly).append(point_id)
+        model.point3D(point_id).xyz = truth[point_id] + 0.02 * rng.choice([-1.0, 1.0], 3)
+    frames = frozenset(model.image(image_id).frame_id for image_id in held_images)
+    options = MappingOptions(ba_refine_focal_length=False, ba_refine_extra_params=False, num_threads=1)
+    adjust_bundle(model, options, held=Held(frames=frames))
+    off = {point_id: np.linalg.norm(model.point3D(point_id).xyz - truth[point_id]) for point_id in truth}
+    assert np.median([off[k] for k in few]) < 0.3 * 0.02 * np.sqrt(3)
+    assert np.min([off[k] for k in mostly]) > 0.9 * 0.02 * np.sqrt(3)

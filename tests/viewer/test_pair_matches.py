@@ -67,11 +67,11 @@ def test_the_picture_shows_matches_on_both_photographs(job: FinishedJob, tmp_pat
     assert (nothing[5, 5] == nothing[5, -5]).all()  # grey: no photographs
 
 
-@pytest.mark.parametrize("name", ["../secret.jpg", "/etc/hostname", "a/../../secret.jpg"])
+@pytest.mark.parametrize("name", ["../secret.jpg", "{}/secret.jpg", "a/../../secret.jpg"])
 def test_photographs_outside_of_the_folder_are_not_read(job: FinishedJob, tmp_path: Path, name: str) -> None:
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "secret.jpg"), np.full((40, 40, 3), 255, np.uint8))
-    names = (name, *job.graph.image_names[1:])
+    names = (name.format(tmp_path), *job.graph.image_names[1:])
     renamed = replace(job, image_path=tmp_path / "images", graph=replace(job.graph, image_names=names))
     pair = job.graph.edges.tolist().index([0, 1])
     drawn = picture(renamed, pair, PairMatches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, dtype=str)))

@@ -14,6 +14,8 @@ from colmap_vg.cli.reporter import Reporter
 from colmap_vg.colmap_io.pair_lists import read_pair_list
 from colmap_vg.errors import DataFileError, OutputError
 from colmap_vg.jobs.graph import solve_options
+from colmap_vg.simulation.database import write_synthetic_database
+from colmap_vg.simulation.views import synthetic_views
 from colmap_vg.viewer.drawing import EXCLUDED, drawing, side_by_side_shift
 from colmap_vg.viewer.finished_job import FinishedJob, read_finished_job
 from colmap_vg.viewer.session import Session
@@ -51,6 +53,19 @@ def test_an_excluded_image_is_lost_and_comes_back(job: FinishedJob) -> None:
     session.exclude_image(0, False)
     assert session.solve().lost.tolist() == []
     np.testing.assert_allclose(session.after.projection_centers, session.before.projection_centers, atol=1e-9)
+
+
+def test_a_trusted_pair_is_used_whatever_filters_say(tmp_path: Path) -> None:
+    views = synthetic_views("drone", 16, noise_px=0.5)
+    write_synthetic_database(tmp_path / "database.db", views)
+    mapper(tmp_path / "database.db", None, tmp_path / "out", MappingOptions(), False, Reporter(quiet=True), False)
+    session = Session(read_finished_job(tmp_path / "out"))
+    false = {tuple(pair) for pair in views.pairs[views.wrong].tolist()}
+    dropped = next(k for k, pair in enumerate(session.job.graph.edges.tolist()) if tuple(pair) in false)
+    assert not session.before.edge_kept[dropped]
+    session.trust_pair(dropped)
+    session.solve()
+    assert session.after.edge_kept[dropped]
 
 
 def test_marks_exclude_each_other(job: FinishedJob) -> None:
