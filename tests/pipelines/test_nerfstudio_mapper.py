@@ -6,10 +6,12 @@ import sys
 from pathlib import Path
 
 import cv2
+import nerfstudio_mapper
 import numpy as np
 import pycolmap
 import pytest
 from nerfstudio_mapper import main
+from rendered_corner import write_jpeg
 
 from colmap_vg.demo import render_photographs
 from colmap_vg.errors import ColmapVgError, ImageFolderError, OutputError
@@ -88,3 +90,15 @@ def test_nothing_is_left_of_a_failed_job(tmp_path: Path) -> None:
     assert list((tmp_path / "deep").iterdir()) == []
     with pytest.raises(ImageFolderError, match="no photographs are there"):
         main(tmp_path / "deep", out)
+
+
+def test_smaller_images_are_as_stored_before_any_exif_orientation(tmp_path: Path) -> None:
+    """As COLMAP and nerfstudio read the images, so that the calibration fits all sizes."""
+    (tmp_path / "images").mkdir()
+    write_jpeg(tmp_path / "images" / "a.jpg", np.zeros((60, 80, 3), np.uint8), orientation=6)
+    first = min((tmp_path / "images").iterdir())
+    stored = cv2.imread(str(first), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION).shape
+    assert cv2.imread(str(first)).shape[:2] == stored[1::-1]
+    nerfstudio_mapper._downscale(tmp_path / "images", 1)
+    small = cv2.imread(str(tmp_path / "images_2" / first.name), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    assert small.shape[:2] == (stored[0] // 2, stored[1] // 2)
