@@ -136,7 +136,7 @@ def _make(
 def _downscale(images: Path, num_downscales: int) -> None:
     """Write the images with halved sizes beside their folder, as they are stored, before any EXIF orientation."""
     for path in sorted(images.iterdir()):
-        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)  # EXIF orientation is ignored, too
         if pixels is None:
             raise ImageFolderError(f"{path.name} cannot be read; convert it to JPEG or PNG")
         for power in range(1, num_downscales + 1):
