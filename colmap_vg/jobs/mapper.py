@@ -26,7 +26,7 @@ from colmap_vg.mapping.build import (
 )
 from colmap_vg.mapping.colors import extract_colors
 from colmap_vg.mapping.extension import extend_model, read_input_model
-from colmap_vg.mapping.georeference import Georeference, georeference
+from colmap_vg.mapping.georeference import Georeference, georeference, level_by_gravity
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.mapping.posed_model import posed_model, scale_is_uncertain, with_placed_sensors
 from colmap_vg.mapping.second_opinion import PointEvidence, best_arrangement, point_evidence
@@ -275,16 +275,22 @@ def _build(
 def _georeferenced(
     cache: "pycolmap.DatabaseCache", models: list[BuiltModel], graph: ViewGraph, options: MappingOptions, log: StageLog
 ) -> list[BuiltModel]:
-    """Move models to the frame of their measured positions, if there are any."""
+    """Move models to the frame of their measured positions, or turn them upright by measured gravity."""
     priors = graph.priors
-    if priors is None or not priors.has_position.any():
+    if priors is None:
+        return models
+    with_gravity = options.solve.use_prior_gravity and priors.has_gravity.any()
+    if not (priors.has_position.any() or with_gravity):
         return models
     with log.stage("georeference"):
         placed = [
             replace(m, georeference=georeference(cache, m.reconstruction, priors, graph.image_ids, options, log))
             for m in models
         ]
-        log.result(f"{sum(m.georeference is not None for m in placed)} of {len(models)} models georeferenced")
+        others = [m.reconstruction for m in placed if m.georeference is None]
+        upright = [level_by_gravity(model, priors, graph.image_ids) for model in others] if with_gravity else []
+        told = f", {sum(upright)} turned upright by gravity" if with_gravity and others else ""
+        log.result(f"{len(placed) - len(others)} of {len(placed)} models georeferenced{told}")
         return placed
 
 

@@ -12,6 +12,7 @@ from colmap_vg.geometry.robust_similarity import AlignedPositions, align_robustl
 from colmap_vg.geometry.similarity import Similarity
 from colmap_vg.mapping.build import adjust_once_more
 from colmap_vg.options import MappingOptions
+from colmap_vg.rotations.gravity import MIN_MEASURED, common_direction
 from colmap_vg.scene.pose_priors import PosePriors
 
 Array = NDArray[np.float64]
@@ -178,6 +179,37 @@ def _level(model: "pycolmap.Reconstruction", priors: PosePriors, image_ids: IntA
             cost = ways[np.argmin(np.nanmean(near**2, axis=1))]
     turn = so3.exp(angles[[np.argmin(cost)]][:, None] * axis)[0]
     move_model(model, Similarity(1.0, turn, middle - turn @ middle))
+
+
+def level_by_gravity(model: "pycolmap.Reconstruction", priors: PosePriors, image_ids: IntArray) -> bool:
+    """Turn a model so that measured gravity points down its third axis, in place.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    priors : PosePriors
+    image_ids : (n,) int64 array
+        Of the priors.
+
+    Returns
+    -------
+    bool
+        False where fewer than three images have a measured gravity, or fewer than half of these agree: the model stays.
+    """
+    inside = np.isin(image_ids, np.array(sorted(model.reg_image_ids()), dtype=np.int64))
+    rows = np.flatnonzero(priors.has_gravity & inside)
+    if len(rows) < MIN_MEASURED:
+        return False
+    R = np.array([model.image(i).cam_from_world().rotation.matrix() for i in image_ids[rows].tolist()])
+    down = common_direction(np.einsum("kba,kb->ka", R, priors.gravities[rows]))
+    if down is None:
+        return False
+    # The axis is any horizontal one where the model is upside down.
+    axis = np.array([-down[1], down[0], 0.0]) if np.hypot(down[0], down[1]) > 1e-12 else np.array([1.0, 0.0, 0.0])
+    angle = np.arctan2(np.hypot(down[0], down[1]), -down[2])
+    turn = so3.exp(angle * axis[None] / np.linalg.norm(axis))[0]
+    move_model(model, Similarity(1.0, turn, np.zeros(3)))
+    return True
 
 
 def _told(

@@ -84,7 +84,7 @@ def refine_by_gravity(
     measured = np.asarray(np.isfinite(gravities).all(axis=1))
     known: Array = np.where(measured[:, None], gravities, 0.0)
     in_world: Array = np.einsum("kba,kb->ka", rotations, known)
-    down = _common_direction(in_world[measured]) if measured.sum() >= MIN_MEASURED else None
+    down = common_direction(in_world[measured]) if measured.sum() >= MIN_MEASURED else None
     if down is None:
         return GravityRefinement(rotations, nothing, nothing)
     flipped = np.asarray(measured & (np.einsum("ka,a->k", in_world, down) < 0.0))
@@ -109,8 +109,8 @@ def refine_by_gravity(
     return GravityRefinement(refined, used, used & flipped)
 
 
-def _common_direction(directions: Array) -> Array | None:
-    """The direction that most unit vectors (k, 3), up to their sign, agree with; None if fewer than half do."""
+def common_direction(directions: Array) -> Array | None:
+    """The direction that most unit vectors (k, 3), k >= 1, agree with up to their sign; None if fewer than half do."""
     cosine = directions @ directions.T
     votes = (np.abs(cosine) >= np.cos(np.radians(AGREEMENT_DEG))).sum(axis=1)
     best = int(np.argmax(votes))

@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -13,14 +14,14 @@ from measured_positions import by_gps, east_north_up, prior, write_priors
 from synthetic_databases import make_database
 from typer.testing import CliRunner
 
-from colmap_vg import MappingOptions
+from colmap_vg import MappingOptions, SolveOptions, align_positions
 from colmap_vg.cli.main import app
 from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.robust_similarity import align_robustly
 from colmap_vg.jobs.mapper import MappingResult, map_database
 from colmap_vg.mapping import bundle
-from colmap_vg.mapping.georeference import georeference, why_not
+from colmap_vg.mapping.georeference import georeference, level_by_gravity, why_not
 from colmap_vg.scene.pose_priors import PosePriors
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.views import SyntheticViews, synthetic_views
@@ -40,7 +41,7 @@ def plain(flight: SyntheticViews, tmp_path_factory: pytest.TempPathFactory) -> P
     return path
 
 
-def mapped(path: Path, output: Path, **options: bool) -> tuple[MappingResult, list[str]]:
+def mapped(path: Path, output: Path, **options: Any) -> tuple[MappingResult, list[str]]:
     log = StageLog()
     return map_database(path, None, output, MappingOptions(num_threads=1, **options), log), log.warnings
 
@@ -171,6 +172,54 @@ def test_positions_link_what_one_pair_does_not(tmp_path: Path) -> None:
     assert np.sqrt(np.mean(errors**2)) < 3.0 * np.sqrt(11 / 30) * 1.5
     result, _ = mapped(tmp_path / "database.db", tmp_path / "alone", use_prior_position=False)
     assert [model.num_reg_images() for model in result.models.values()] == [17, 13]
+
+
+def with_gravity(flight: SyntheticViews, path: Path, share_wrong: float) -> None:
+    """Add directions of gravity, 1 degree off, to three quarters of the images; some at random or upside down."""
+    rng, priors = np.random.default_rng(2), []
+    for row in range(0, NUM_IMAGES * 3 // 4):
+        down = flight.cam_from_world_rotations[row] @ [0.0, 0.0, -1.0] + np.radians(1.0) * rng.normal(size=3)
+        if rng.random() < share_wrong:
+            down = -down if row % 2 else rng.normal(size=3)
+        found = pycolmap.PosePrior(gravity=down / np.linalg.norm(down))
+        found.corr_data_id = pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1), row + 1)
+        priors.append(found)
+    write_priors(path, priors)
+
+
+@pytest.mark.parametrize("share_wrong", [0.0, 0.3])
+def test_models_without_positions_are_turned_upright(
+    plain: Path, flight: SyntheticViews, tmp_path: Path, share_wrong: float
+) -> None:
+    path = Path(shutil.copyfile(plain, tmp_path / "database.db"))
+    with_gravity(flight, path, share_wrong)
+    tilts = []
+    for k, options in enumerate(({}, {"solve": SolveOptions(use_prior_gravity=False)})):
+        result, _ = mapped(path, tmp_path / str(k), **options)
+        assert result.georeferences[0] is None
+        images = [image for image in result.models[0].images.values() if image.has_pose]
+        truth = flight.projection_centers[[int(image.name[:5]) for image in images]]
+        _, similarity = align_positions(np.array([image.projection_center() for image in images]), truth)
+        tilts.append(np.degrees(np.arccos(np.clip(similarity.rotation[2, 2], -1.0, 1.0))))
+    assert tilts[0] < 3.0 / np.sqrt(NUM_IMAGES / 2)  # thrice the noise of the mean
+    assert tilts[1] > 5.0
+
+
+@pytest.mark.parametrize("down", [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-0.6, 0.64, 0.48]])
+def test_any_direction_is_turned_down(down: list[float]) -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=5))
+    ids = np.array(sorted(model.reg_image_ids()))
+    before = {i: model.image(i).cam_from_world().rotation.matrix() for i in ids.tolist()}
+    gravities = np.array([before[i] @ down for i in ids.tolist()])
+    priors = PosePriors(np.full((len(ids), 3), np.nan), np.full((len(ids), 3, 3), np.nan), gravities)
+    assert level_by_gravity(model, priors, ids)
+    for i, gravity in zip(ids.tolist(), gravities, strict=True):
+        np.testing.assert_allclose(
+            model.image(i).cam_from_world().rotation.matrix().T @ gravity, [0.0, 0.0, -1.0], atol=1e-9
+        )
+    few = replace(priors, gravities=np.where(np.arange(len(ids))[:, None] < 2, gravities, np.nan))
+    assert not level_by_gravity(model, few, ids)
 
 
 @pytest.mark.parametrize("system", ["CARTESIAN", "WGS84"])
