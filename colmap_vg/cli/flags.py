@@ -36,6 +36,13 @@ MapperImagePath = Annotated[
 DatabasePath = Annotated[
     Path, typer.Option("--database_path", help="COLMAP database with verified matches. It is never modified.")
 ]
+ImagePathOfJob = Annotated[
+    Path | None, typer.Option("--image_path", help="Folder of the photographs. Default: that of the job.")
+]
+DatabasePathOfJob = Annotated[
+    Path | None,
+    typer.Option("--database_path", help="The job's database, never modified. Default: that of the job."),
+]
 OutputPath = Annotated[
     Path, typer.Option("--output_path", help="Folder for models and summary. It is created if missing.")
 ]

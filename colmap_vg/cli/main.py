@@ -212,7 +212,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
 ) -> None:
     """Write a model in the format of another program: undistorted images for splatting, nerfstudio, PLY and others."""
-    with _job(False, False) as reporter:
+    with _job() as reporter:
         import colmap_vg.cli.jobs as jobs
 
         jobs.export(input_path, output_path, format, image_path, model, max_image_size, overwrite, reporter)
@@ -221,13 +221,8 @@ def export(
 @app.command()
 def report(
     output_path: Annotated[Path, typer.Option("--output_path", help="Folder of a finished job.")],
-    image_path: Annotated[
-        Path | None, typer.Option("--image_path", help="Folder of the photographs. Default: that of the job.")
-    ] = None,
-    database_path: Annotated[
-        Path | None,
-        typer.Option("--database_path", help="The job's database, never modified. Default: that of the job."),
-    ] = None,
+    image_path: flags.ImagePathOfJob = None,
+    database_path: flags.DatabasePathOfJob = None,
 ) -> None:
     """Write OUT/report.html: a page to look at the result of a finished job, without a network."""
     with _job() as reporter:
@@ -239,13 +234,8 @@ def report(
 @app.command()
 def view(
     output_path: Annotated[Path, typer.Option("--output_path", help="Folder of a finished job. It is not changed.")],
-    image_path: Annotated[
-        Path | None, typer.Option("--image_path", help="Folder of the photographs. Default: that of the job.")
-    ] = None,
-    database_path: Annotated[
-        Path | None,
-        typer.Option("--database_path", help="The job's database, never modified. Default: that of the job."),
-    ] = None,
+    image_path: flags.ImagePathOfJob = None,
+    database_path: flags.DatabasePathOfJob = None,
     lists_path: Annotated[
         Path | None,
         typer.Option("--lists_path", help="Folder that lists of pairs are saved to. Default: OUT_lists beside OUT."),
@@ -259,7 +249,7 @@ def view(
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="First port that is tried. 0: any.")] = 8080,
 ) -> None:
     """Explore a finished job: exclude or trust pairs and images, solve again, and save the lists for mapper."""
-    with _job(False, False) as reporter:
+    with _job() as reporter:
         from colmap_vg.cli.exploring import view
 
         view(output_path, image_path, database_path, lists_path, backend, host, port, reporter)
