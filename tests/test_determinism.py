@@ -13,6 +13,8 @@ from rendered_corner import render_corner
 from colmap_vg import align_positions
 from colmap_vg.report.page import write_report
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = ["--max_num_features", "500", "--max_image_size", "320"]
 MAX_POSITION_SHARE, MAX_ANGLE_DEG = 1e-3, 0.05
 """Between runs with several threads: of the scene's radius, and degrees. Sums in another order change bundle adjustment

@@ -10,6 +10,8 @@ import pytest
 from rendered_corner import render_corner
 from synthetic_databases import make_database
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["--max_num_features", "300", "--max_image_size", "240", "--num_threads", "1"]
 
 

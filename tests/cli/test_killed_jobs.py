@@ -16,6 +16,8 @@ import pytest
 from rendered_corner import render_corner
 from synthetic_databases import make_database, sha256
 
+pytestmark = pytest.mark.slow
+
 NUM_KILLS = int(os.environ.get("COLMAP_VG_NUM_KILLS", "2"))
 SMALL = ["--max_num_features", "300", "--max_image_size", "240", "--num_threads", "1", "--verbose"]
 MODEL_FILES = {"cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"}
@@ -174,7 +176,6 @@ def test_other_verbs_leave_no_half_model_either(tmp_path: Path, verb: str, stage
     assert {path.name for path in (tmp_path / "out" / ".work").iterdir()} == {"job.json"}
 
 
-@pytest.mark.slow
 def test_a_demo_goes_on_with_its_photographs(tmp_path: Path) -> None:
     arguments = ["demo", "--output_path", tmp_path, "--num_images", 4, "--num_threads", 1, "--verbose"]
     kill_at("features: started", *arguments)

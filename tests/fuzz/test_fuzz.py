@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 NUM_CASES = int(os.environ.get("COLMAP_VG_NUM_FUZZ", "25"))
 FIRST_SEED = int(os.environ.get("COLMAP_VG_FIRST_FUZZ", "0"))
 MAX_SECONDS = 60.0

@@ -16,6 +16,8 @@ from rendered_corner import write_jpeg
 from colmap_vg.demo import render_photographs
 from colmap_vg.errors import ColmapVgError, ImageFolderError, OutputError
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = Path(__file__).parents[2] / "pipelines" / "nerfstudio_mapper.py"
 
 

@@ -17,6 +17,8 @@ from paper.scenes import set_conditions
 
 from colmap_vg.errors import OptionError
 
+pytestmark = pytest.mark.slow
+
 PIPELINE = Path(__file__).parents[2] / "pipelines" / "paper_tables.py"
 
 

@@ -9,6 +9,8 @@ from rendered_corner import render_corner
 
 from colmap_vg.errors import ColmapVgError, OptionError
 
+pytestmark = pytest.mark.slow
+
 
 def run(way: str, seconds: float, inliers: int, error: float | None) -> PhotographRun:
     stages = tuple((stage, seconds, 2 * seconds) for stage in STAGES)

@@ -128,6 +128,7 @@ def test_weighing_edges_by_their_information_halves_the_error():
     assert errors[1] < 0.5 * errors[0]
 
 
+@pytest.mark.slow
 def test_the_weighted_form_forgets_false_edges_and_rotations_gain():
     n, rng = 40, np.random.default_rng(1)
     scene, (_, edges, relative, directions, _R, p) = _started(n, 10, rotation_sigma=0.0, direction_sigma=0.0, seed=3)
