@@ -70,6 +70,7 @@ def test_pixels_see_the_points_that_project_into_them(caster: RayCaster) -> None
     assert np.abs(np.einsum("ka,ka->k", points - corner, normal)).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_photographs_are_the_seeds_and_tell_colmap_their_focal_length(tmp_path: Path) -> None:
     folders = [tmp_path / name for name in ("a", "b", "c")]
     for folder, seed in zip(folders, (4, 4, 5), strict=True):
@@ -84,6 +85,7 @@ def test_photographs_are_the_seeds_and_tell_colmap_their_focal_length(tmp_path: 
     assert guess.mean_focal_length() == pytest.approx(cameras.camera.mean_focal_length(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_photographs(tmp_path: Path) -> None:
     for threads in (1, 3):
         (tmp_path / str(threads)).mkdir()

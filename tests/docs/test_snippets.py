@@ -47,7 +47,7 @@ NEED_PHOTOGRAPHS = ("run", "demo")
 """Verbs whose commands run on rendered photographs. Scripts of pipelines/ are only parsed: they need data."""
 
 OTHER_PROGRAMS_FLAGS = {
-    "pytest": ("--benchmark-only",),
+    "pytest": ("--benchmark-only", "--run-slow"),
     "ruff": ("--check",),
     "sphinx-build": ("--keep-going",),
     "ns-process-data": ("--colmap-cmd", "--sfm-tool", "--matching-method", "--output-dir", "--data"),

@@ -31,6 +31,7 @@ def normalized_errors(problem, R, p):
     return np.mean(squares, axis=1) / 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "free"), [(0.0, False), (0.1, False), (0.0, True)])
 def test_errors_are_as_large_as_the_covariances_say(wrong, free):
     errors = []
@@ -91,6 +92,7 @@ def test_each_unknown_of_the_lens_takes_up_a_residual():
     assert held**-2 - focal**-2 == pytest.approx(focal**-2 - both**-2, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_many_draws_of_one_scene():
     # The same cameras, points and visibility, with other noise each time.
     exact, R, p = image_set(3, "ring", 10, 150, 0.0)

@@ -86,6 +86,7 @@ def test_pure_noise_does_not_determine_the_scale() -> None:
     assert found.scale_uncertainty > 0.3
 
 
+@pytest.mark.slow
 def test_the_estimate_is_as_certain_as_it_says() -> None:
     scales, told = [], []
     for seed in range(200):
@@ -109,6 +110,7 @@ def test_bad_input_is_refused(estimated: np.ndarray, measured: np.ndarray, told:
         align_robustly(estimated, measured)
 
 
+@pytest.mark.slow
 def test_few_right_positions_are_rarely_called_wrong() -> None:
     wrong = sum(
         int((~align_robustly(*scene(n, 1.0, 0, seed)[:2]).right).sum()) for n in (3, 5, 8, 30) for seed in range(50)

@@ -23,7 +23,7 @@ COUNT_COLORS = """async () => {
   context.drawImage(image, 0, 0);
   return new Set(new Uint32Array(context.getImageData(0, 0, 300, 300).data.buffer)).size;
 }"""
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
 
 
 @pytest.fixture(scope="module")
