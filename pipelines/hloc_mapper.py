@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from stage_lines import show_stages, show_warnings
 
 import colmap_vg
 from colmap_vg.errors import DataFileError, ImageFolderError, OptionError, OutputError
-from colmap_vg.events import StageEvent
 
 COLMAP_FROM_HLOC_PX = 0.5
 """hloc has the middle of the first pixel at 0, COLMAP at 0.5."""
@@ -104,7 +104,7 @@ def main(
         if not skip_geometric_verification:
             _verify(database_path, work / "pairs.txt", imported, options.random_seed)
         found = colmap_vg.view_graph_mapping(
-            database_path, photographs, work / "models", options, on_event=_show if verbose else _show_warnings
+            database_path, photographs, work / "models", options, on_event=show_stages if verbose else show_warnings
         )
         _publish(work, sfm, len(found))
     return found[0]
@@ -308,17 +308,6 @@ def _opened(path: Path) -> Any:
         return h5py.File(path, "r")
     except OSError as error:
         raise DataFileError(f"{path} is not an HDF5 file, or is damaged: {error}") from error
-
-
-def _show(event: StageEvent) -> None:
-    if event.state == "finished":
-        print(f"{event.stage}: {event.message} ({event.seconds:.1f} s)", flush=True)
-    _show_warnings(event)
-
-
-def _show_warnings(event: StageEvent) -> None:
-    if event.state == "warning":
-        print(f"warning: {event.message}", file=sys.stderr)
 
 
 def _entries(words: Sequence[str]) -> dict[str, Any]:

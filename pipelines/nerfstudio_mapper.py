@@ -15,10 +15,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+from stage_lines import show_stages, show_warnings
 
 import colmap_vg
 from colmap_vg.errors import ImageFolderError, OutputError
-from colmap_vg.events import StageEvent
 from colmap_vg.exports.nerfstudio import write_nerfstudio
 from colmap_vg.exports.source import find_source
 from colmap_vg.options import FeatureOptions, MappingOptions
@@ -123,7 +123,7 @@ def _make(
     for number, path in enumerate(photographs, start=1):
         shutil.copyfile(path, images / f"frame_{number:05d}{path.suffix.lower()}")
     models = colmap_vg.image_folder_mapping(
-        images, colmap / "sparse", features, MappingOptions(), _show if verbose else _show_warnings
+        images, colmap / "sparse", features, MappingOptions(), show_stages if verbose else show_warnings
     )
     (colmap / "sparse" / "database.db").rename(colmap / "database.db")
     shutil.rmtree(colmap / "sparse" / ".work", ignore_errors=True)
@@ -148,17 +148,6 @@ def _downscale(images: Path, num_downscales: int) -> None:
             if not written:
                 raise ImageFolderError(f"{path.name} cannot be written at a smaller size; convert it to JPEG or PNG")
             (folder / path.name).write_bytes(encoded.tobytes())
-
-
-def _show(event: StageEvent) -> None:
-    if event.state == "finished":
-        print(f"{event.stage}: {event.message} ({event.seconds:.1f} s)", flush=True)
-    _show_warnings(event)
-
-
-def _show_warnings(event: StageEvent) -> None:
-    if event.state == "warning":
-        print(f"warning: {event.message}", file=sys.stderr)
 
 
 def command_line() -> None:

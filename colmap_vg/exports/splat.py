@@ -11,7 +11,7 @@ import pycolmap
 from colmap_vg.colmap_io.reconstruction import write_model
 from colmap_vg.errors import ImageFolderError, MappingError
 from colmap_vg.exports.source import Source
-from colmap_vg.features.photographs import Photograph, check_photograph
+from colmap_vg.features.photographs import Photograph, check_photograph, leads_out
 
 SPARSE = Path("sparse") / "0"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -67,8 +67,7 @@ def write_splat(source: Source, folder: Path, max_image_size: int | None = None)
 
 def _check(image: "pycolmap.Image", camera: "pycolmap.Camera", photographs: Path) -> None:
     """Check what COLMAP does not check, skips without an error, or aborts the process for."""
-    parts = PurePosixPath(image.name).parts
-    if not parts or parts[0] == "/" or ".." in parts:
+    if not PurePosixPath(image.name).parts or leads_out(image.name):
         raise MappingError(f"the image name {image.name!r} leads out of the output folder: rename the image")
     if camera.is_spherical():
         raise MappingError(f"{image.name!r} has a spherical camera, which no pinhole camera replaces")

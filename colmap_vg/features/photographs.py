@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pycolmap
@@ -32,6 +32,16 @@ SUFFIXES = (
 
 _HEIF_SUFFIXES = (".heic", ".heif")
 _FULL_SIXTEEN_BITS = 1 << 15
+
+
+def leads_out(name: str) -> bool:
+    """Whether an image's name, relative to the folder of photographs, leads out of it.
+
+    >>> leads_out("a/b.jpg"), leads_out("../b.jpg"), leads_out("/b.jpg")
+    (False, True, True)
+    """
+    path = PurePosixPath(name)
+    return path.is_absolute() or ".." in path.parts
 
 
 @dataclass(frozen=True)

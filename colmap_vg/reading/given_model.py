@@ -18,6 +18,7 @@ from colmap_vg.colmap_io.tables import DEGENERATE, WATERMARK, DatabaseTables
 from colmap_vg.errors import DataFileError
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.options import ReadOptions
+from colmap_vg.reading.verification import MAX_ERROR_PX
 from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.two_view.essential import essential_from_pose
@@ -28,8 +29,6 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-MAX_ERROR_PX = 4.0
-"""COLMAP's threshold of two-view verification, pixels."""
 MIN_SHARE_AGREEING = 0.8
 """Minimum share of a pair's matches within the threshold for the model to explain it."""
 MIN_SHARE_EXPLAINED = 0.5

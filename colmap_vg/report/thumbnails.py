@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.features.photographs import leads_out
+
 MAX_THUMBNAILS, MANY = 1000, 200
 """Maximum number of thumbnails, and their number from which they are smaller."""
 SIDE, SMALL_SIDE, PREVIEW_SIDE = 96, 64, 320
@@ -56,7 +58,7 @@ def photograph(folder: Path, name: str, side: int) -> NDArray[np.uint8] | None:
     """
     try:
         # Links in the folder are the user's, and may lead anywhere; names are the database's.
-        if Path(name).is_absolute() or ".." in Path(name).parts:
+        if leads_out(name):
             return None
         pixels = _decoded(np.frombuffer((folder / name).read_bytes(), dtype=np.uint8), side)
     except (OSError, ValueError, cv2.error):  # a name with a zero byte is a ValueError

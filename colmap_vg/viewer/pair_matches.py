@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.database import reading
 from colmap_vg.colmap_io.tables import MAX_NUM_IMAGES
 from colmap_vg.geometry.directions import normalized
+from colmap_vg.reading.verification import MAX_ERROR_PX
 from colmap_vg.report.thumbnails import photograph
 from colmap_vg.scene.solution import PoseSolution
 from colmap_vg.two_view.essential import essential_from_pose
@@ -21,8 +22,6 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Picture = NDArray[np.uint8]
 
-MAX_ERROR_PX = 4.0
-"""COLMAP's threshold of two-view verification, pixels."""
 MAX_SHOWN, HEIGHT, MAX_WIDTH, GAP = 200, 360, 640, 8
 """Maximum number of matches drawn of each kind; height and maximum width of a photograph, and the gap, pixels."""
 

@@ -136,7 +136,7 @@ def test_ids_of_the_model_need_not_be_those_of_the_database(scene: Path, tmp_pat
 
 
 def known_poses(folder: Path, views: SyntheticViews, sigma: float, names: range, width: int = WIDTH) -> Path:
-    """A text model of poses only, turned by `sigma` radians and shifted by a third of the distance of neighbours."""
+    """A text model of poses only, turned by `sigma` radians and shifted by 10 `sigma` metres, along each axis."""
     rng = np.random.default_rng(0)
     lines = []
     for k in names:
