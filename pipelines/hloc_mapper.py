@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from stage_lines import show_stages, show_warnings
+from drop_in.stage_lines import show_stages, show_warnings
 
 import colmap_vg
 from colmap_vg.errors import DataFileError, ImageFolderError, OptionError, OutputError

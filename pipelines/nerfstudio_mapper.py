@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
-from stage_lines import show_stages, show_warnings
+from drop_in.stage_lines import show_stages, show_warnings
 
 import colmap_vg
 from colmap_vg.errors import ImageFolderError, OutputError

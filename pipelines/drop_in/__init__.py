@@ -1,0 +1,1 @@
+"""What the scripts that take the place of other programs share."""
