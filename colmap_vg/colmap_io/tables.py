@@ -291,9 +291,11 @@ class _Reader:
             values = self._values(blob, np.float64, where)
             if len(values) not in (0, size):
                 raise self._damaged(where, f"it holds {len(values)} values, expected {size}")
-            # Matrices and poses with extreme values count as missing: COLMAP writes none, and they would overflow.
-            if len(values) and 1e-50 < np.nan_to_num(np.abs(values).max(), nan=np.inf) < 1e50:
+            if len(values):
                 out[k] = values
+        # Matrices and poses with extreme values count as missing: COLMAP writes none, and they would overflow.
+        largest = np.abs(out).max(axis=1)
+        out[~((largest > 1e-50) & (largest < 1e50))] = np.nan
         return out
 
     def _check_id(self, value: object, before: list[int], where: str, highest: int) -> None:

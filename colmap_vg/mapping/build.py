@@ -281,14 +281,14 @@ def _remove_unsupported(mapper: "pycolmap.IncrementalMapper", kept_frames: froze
     removed: set[int] = set()
     while True:
         frames = {i: reconstruction.image(i).frame_id for i in sorted(reconstruction.reg_image_ids())}
-        asked = (
-            [image_id for image_id, frame_id in frames.items() if frame_id not in kept_frames] if kept_frames else None
-        )
         support: Counter[int] = Counter()
-        counts = supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG, image_ids=asked)
-        for image_id, count in counts.items():
+        for image_id, count in supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG).items():
             support[frames[image_id]] += count
-        weak = [(count, frame_id) for frame_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]
+        weak = [
+            (count, frame_id)
+            for frame_id, count in support.items()
+            if count < MIN_SUPPORTED_OBSERVATIONS and frame_id not in kept_frames
+        ]
         if not weak:
             return removed
         _, frame_id = min(weak)

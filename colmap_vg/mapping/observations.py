@@ -12,8 +12,9 @@ from colmap_vg.linear.robust_losses import cauchy_weight
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-NUM_SAMPLED_POINTS = 1500
-"""Points from which the scale of the loss is estimated, evenly from all: their residuals tell it to a few per cent."""
+NUM_SAMPLED_OBSERVATIONS = 4000
+"""Observations from which the scale of the loss is estimated, about this many, of points drawn evenly from all: their
+residuals tell it to a few per cent."""
 MIN_SIGMA_PX = 0.1
 """Minimum standard deviation of keypoints, pixels: that of the sharpest detectors."""
 SCALES_IN_SIGMAS = np.geomspace(0.8, 16.0, 25)
@@ -121,7 +122,8 @@ def _squared_errors(reconstruction: "pycolmap.Reconstruction", min_track_length:
     long = [p for _, p in sorted(reconstruction.points3D.items()) if p.track.length() >= min_track_length]
     if not long:
         return np.zeros(0)
-    rows = np.linspace(0, len(long) - 1, min(len(long), NUM_SAMPLED_POINTS)).astype(np.int64)
+    share = min(1.0, NUM_SAMPLED_OBSERVATIONS / sum(p.track.length() for p in long))
+    rows = np.linspace(0, len(long) - 1, max(round(share * len(long)), 1)).astype(np.int64)
     sample = Observations.of(reconstruction, [long[row] for row in np.unique(rows).tolist()])
     # A point takes up three of the 2 L coordinates of its track, which reduces their residuals.
     length = np.bincount(sample.point_row)[sample.point_row]

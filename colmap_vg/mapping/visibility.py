@@ -1,12 +1,14 @@
 """Visibility of a model's points: which images observe them, and into which images they project."""
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MAX_NUM_POINTS = 3000
@@ -49,19 +51,30 @@ def sampled_tracks(
         All registered images; the columns of the result.
     max_num_points : int
     """
-    row_of = {image_id: row for row, image_id in enumerate(image_ids)}
-    tracks = [
-        (point.xyz, sorted({row_of[element.image_id] for element in point.track.elements}))
-        for _, point in sorted(reconstruction.points3D.items())
-    ]
-    tracks = sorted((t for t in tracks if len(t[1]) >= MIN_TRACK_LENGTH), key=lambda t: len(t[1]))
-    if not tracks:
-        return SampledTracks(np.zeros((0, 3)), np.zeros((0, len(image_ids)), dtype=bool), 0)
-    sampled = [tracks[k] for k in np.unique(np.linspace(0, len(tracks) - 1, max_num_points).astype(int))]
-    sees = np.zeros((len(sampled), len(image_ids)), dtype=bool)
-    for row, (_, seen_in) in enumerate(sampled):
-        sees[row, seen_in] = True
-    return SampledTracks(np.array([position for position, _ in sampled]), sees, sum(len(seen) for _, seen in tracks))
+    n = len(image_ids)
+    # Each image once, even if it sees a point at two keypoints.
+    observed, image_row = observed_points(reconstruction, image_ids)
+    observed, image_row = np.divmod(np.unique(observed * n + image_row), n)
+    point_ids, point_row, length = np.unique(observed, return_inverse=True, return_counts=True)
+    by_length = np.argsort(length, kind="stable")
+    by_length = by_length[length[by_length] >= MIN_TRACK_LENGTH]
+    if not len(by_length):
+        return SampledTracks(np.zeros((0, 3)), np.zeros((0, n), dtype=bool), 0)
+    sampled = by_length[np.unique(np.linspace(0, len(by_length) - 1, max_num_points).astype(int))]
+    row_of = np.full(len(point_ids), -1)
+    row_of[sampled] = np.arange(len(sampled))
+    counted = row_of[point_row] >= 0
+    sees = np.zeros((len(sampled), n), dtype=bool)
+    sees[row_of[point_row[counted]], image_row[counted]] = True
+    positions = np.array([reconstruction.point3D(i).xyz for i in point_ids[sampled].tolist()])
+    return SampledTracks(positions, sees, int(length[by_length].sum()))
+
+
+def observed_points(reconstruction: "pycolmap.Reconstruction", image_ids: list[int]) -> tuple[IntArray, IntArray]:
+    """Ids of the points that images observe, and the row of the image, of each observation: two (k,) arrays."""
+    observed = [reconstruction.image(image_id).get_observation_points2D() for image_id in image_ids]
+    point_ids = np.array([keypoint.point3D_id for keypoint in chain.from_iterable(observed)], dtype=np.int64)
+    return point_ids, np.repeat(np.arange(len(image_ids)), [len(each) for each in observed])
 
 
 def in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xyz: Array) -> BoolArray:

@@ -119,7 +119,7 @@ def test_the_scale_is_estimated_from_points_of_every_kind(monkeypatch: pytest.Mo
             if point.point3D_id > 80:  # of 400
                 point.xy += 4.0 * (point.xy - exact.image(image_id).points2D[row].xy)
     every = loss_scale(found, 3)
-    monkeypatch.setattr(observations, "NUM_SAMPLED_POINTS", 80)
+    monkeypatch.setattr(observations, "NUM_SAMPLED_OBSERVATIONS", 400)
     assert loss_scale(found, 3) == pytest.approx(every, rel=0.1)
 
 
