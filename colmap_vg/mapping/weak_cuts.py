@@ -206,17 +206,18 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     # Pair each image that sees a point with each image that the point projects into.
     rows, offsets = rows_of_segments(sights.astype(np.int64), seen_point)
     beside = segment_of_rows(offsets)
-    point, image, near = point_of_sight[rows], looking[rows], seeing[beside]
+    tried = were_compared[looking[rows], seeing[beside]]
+    point, image, near = point_of_sight[rows[tried]], looking[rows[tried]], seeing[beside[tried]]
     centers = np.array([reconstruction.image(i).projection_center() for i in ids])
     to_image, to_near = centers[image] - tracks.points[point], centers[near] - tracks.points[point]
     farther = np.log(np.linalg.norm(to_image, axis=1) / np.linalg.norm(to_near, axis=1))
     to_image, to_near = normalized(to_image), normalized(to_near)
-    cosine = np.einsum("ka,ka->k", to_image, to_near)
+    alike = np.einsum("ka,ka->k", to_image, to_near) >= np.cos(np.radians(NEAR_DEG))
+    alike &= np.abs(farther) <= np.log(MAX_DISTANCE_RATIO)
+    point, image, near, to_image, to_near = point[alike], image[alike], near[alike], to_image[alike], to_near[alike]
     normals, flat = _normals(reconstruction, tracks.points)
     facing = np.einsum("ka,ka->k", normals[point], to_image) / np.einsum("ka,ka->k", normals[point], to_near)
-    alike = ~flat[point] | (np.abs(facing - 1.0) <= MAX_FORESHORTENING)
-    expected = (cosine >= np.cos(np.radians(NEAR_DEG))) & (np.abs(farther) <= np.log(MAX_DISTANCE_RATIO))
-    expected &= were_compared[image, near] & alike
+    expected = ~flat[point] | (np.abs(facing - 1.0) <= MAX_FORESHORTENING)
     return _Expected(point[expected], image[expected], near[expected], tracks.sees[point, image][expected])
 
 
