@@ -9,19 +9,18 @@ refinement within the chosen consensus.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.geometry import so3
+from colmap_vg.geometry import quaternions, so3
 from colmap_vg.rotations.alternatives import nearest_alternative
 from colmap_vg.rotations.cycles import closing_shares, rival_share
 from colmap_vg.rotations.refinement import AGREEMENT_DEG, capped_likelihoods, refine_rotations
 from colmap_vg.rotations.robust import average_rotations_robust
 from colmap_vg.rotations.spanning_tree import spanning_tree
 from colmap_vg.rotations.votes import rotations_by_votes
-from colmap_vg.scene.edge_residuals import rotation_residuals
 from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
@@ -160,6 +159,7 @@ class _Search:
         self.num_images, self.edges, self.relative = num_images, edges, relative
         self._likelihoods = likelihoods / np.median(likelihoods)
         self._capped = capped_likelihoods(likelihoods)
+        self._quaternions = quaternions.from_matrices(relative)
         self._heaviest = cache(self._find_heaviest)
         self._skeleton = self._heaviest(SKELETON_EDGES)
         self._averaged = np.ones(len(edges), dtype=bool)
@@ -169,9 +169,12 @@ class _Search:
 
     def add(self, rotations: Array) -> None:
         """Add a candidate."""
-        residuals = rotation_residuals(self.edges, self.relative, rotations)
+        i, j = self.edges.T
+        q = quaternions.from_matrices(rotations)
+        turns = quaternions.multiply(q[:, j], quaternions.conjugate(q)[:, i])
+        cosine = np.abs(np.einsum("cm,cm->m", turns, self._quaternions))
         self._candidates.append(rotations)
-        self._agree.append(residuals <= np.radians(AGREEMENT_DEG))
+        self._agree.append(cosine >= np.cos(np.radians(0.5 * AGREEMENT_DEG)))
 
     def add_backbone(self) -> None:
         """Add the solution from the two heaviest edges of each image.
@@ -268,17 +271,23 @@ class _Search:
 
         All edges if all weights are equal.
         """
+        if np.ptp(self._likelihoods) == 0:
+            return np.ones(len(self.edges), dtype=bool)
+        in_tree, rank = self._tree_and_ranks
+        return np.asarray(in_tree | (rank < count))
+
+    @cached_property
+    def _tree_and_ranks(self) -> tuple[BoolArray, IntArray]:
+        """Whether each edge (m,) is in the maximum spanning tree, and its better rank by weight at its two images."""
         weights, num_edges = self._likelihoods, len(self.edges)
-        if np.ptp(weights) == 0:
-            return np.ones(num_edges, dtype=bool)
         ends, rows = self.edges.T.ravel(), np.tile(np.arange(num_edges), 2)
         order = np.lexsort((rows, -weights[rows], ends))
-        rank = np.arange(len(order)) - np.searchsorted(ends[order], np.arange(self.num_images))[ends[order]]
-        chosen = np.zeros(num_edges, dtype=bool)
-        chosen[rows[order[rank < count]]] = True
+        rank = np.empty(2 * num_edges, dtype=np.int64)
+        rank[order] = np.arange(len(order)) - np.searchsorted(ends[order], np.arange(self.num_images))[ends[order]]
+        in_tree = np.zeros(num_edges, dtype=bool)
         _, tree, _ = spanning_tree(self.num_images, self.edges, weights)
-        chosen[tree[tree >= 0]] = True
-        return chosen
+        in_tree[tree[tree >= 0]] = True
+        return in_tree, rank.reshape(2, -1).min(axis=0)
 
 
 def _lead(weights: Array, agree: Array, other: Array) -> float:
