@@ -57,7 +57,7 @@ def joint_of(
     Parameters
     ----------
     own, other : pycolmap.Reconstruction
-        Of the same database, with points, without a common image.
+        Of the same database, with points.
     graph : ViewGraph
         With the keypoints of the matches of all pairs.
     usable : (m,) bool array
@@ -146,17 +146,20 @@ def _identified(
         return
     ids = graph.image_ids[graph.edges]
     sides = [np.isin(ids, sorted(model.reg_image_ids())) for model in (own, other)]
-    points: dict[int, IntArray] = {}
-    for edge in np.flatnonzero(usable & (sides[0] & sides[1][:, ::-1]).any(axis=1)).tolist():
+    # An image that both models registered by its points may be at either end.
+    forward, backward = sides[0][:, 0] & sides[1][:, 1], sides[0][:, 1] & sides[1][:, 0]
+    points: dict[tuple[int, int], IntArray] = {}
+    for edge in np.flatnonzero(usable & (forward | backward)).tolist():
         rows = slice(*offsets[edge : edge + 2].tolist())
         matches, images = np.stack([keypoints1[rows], keypoints2[rows]], axis=1).astype(np.int64), ids[edge]
-        if not sides[0][edge, 0]:
+        if not forward[edge]:
             matches, images = matches[:, ::-1], images[::-1]
-        for model, image_id in zip((own, other), images.tolist(), strict=True):
-            if image_id not in points:
-                found = np.array([p.point3D_id for p in model.image(image_id).points2D], dtype=np.uint64)
-                points[image_id] = np.where(found == NO_POINT, 0, found).astype(np.int64)
-        seen = np.stack([points[i][m] for i, m in zip(images.tolist(), matches.T, strict=True)], axis=1)
+        ends = list(enumerate(images.tolist()))
+        for side, image_id in ends:
+            if (side, image_id) not in points:
+                found = np.array([p.point3D_id for p in (own, other)[side].image(image_id).points2D], dtype=np.uint64)
+                points[side, image_id] = np.where(found == NO_POINT, 0, found).astype(np.int64)
+        seen = np.stack([points[end][m] for end, m in zip(ends, matches.T, strict=True)], axis=1)
         both = (seen > 0).all(axis=1)
         yield np.concatenate([seen[both], np.tile(images, (int(both.sum()), 1)), matches[both]], axis=1)
 
