@@ -118,6 +118,11 @@ def has_radial_term(camera: "pycolmap.Camera") -> bool:
     return camera.model_name in _DISTORTED_BY_POLYNOMIAL or camera.model_name == "FOV"
 
 
+def is_bent_by_focal(camera: "pycolmap.Camera") -> bool:
+    """Whether undistorted pixels depend on the focal length: those of fisheyes do, however small their distortion."""
+    return "FISHEYE" in camera.model_name
+
+
 def is_undistorted(camera: "pycolmap.Camera") -> bool:
     """Whether a camera whose model has a radial term has no distortion; COLMAP's initial FOV camera counts as such."""
     largest = max((abs(camera.params[k]) for k in camera.extra_params_idxs()), default=0.0)

@@ -15,6 +15,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.parse import quote
 
+import pycolmap
+
 from colmap_vg.errors import DatabaseError
 
 REQUIRED_TABLES = ("cameras", "images", "keypoints", "two_view_geometries")
@@ -75,11 +77,19 @@ def check_database(database_path: str | PathLike[str]) -> None:
         if num_images == 0:
             raise DatabaseError(f"{database_path}: contains no images; extract features first")
         (num_pairs,) = connection.execute("SELECT COUNT(*) FROM two_view_geometries WHERE rows > 0").fetchone()
-        if num_pairs == 0:
+        if num_pairs == 0 and not _has_unverified_fisheyes(connection):
             raise DatabaseError(
                 f"{database_path}: contains {num_images} images but no verified pairs; match them first"
                 " (colmap exhaustive_matcher), or verify the matches (colmap geometric_verifier)"
             )
+
+
+def _has_unverified_fisheyes(connection: sqlite3.Connection) -> bool:
+    """Whether there are matches of fisheyes without a focal length, of which COLMAP verifies no pair."""
+    fisheyes = [int(model) for name, model in pycolmap.CameraModelId.__members__.items() if "FISHEYE" in name]
+    cameras = connection.execute("SELECT model FROM cameras WHERE prior_focal_length = 0").fetchall()
+    (num_pairs,) = connection.execute("SELECT COUNT(*) FROM matches WHERE rows > 0").fetchone()
+    return num_pairs > 0 and any(model in fisheyes for (model,) in cameras)
 
 
 def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:

@@ -3,15 +3,18 @@
 import sqlite3
 from dataclasses import replace
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.database import reading
-from colmap_vg.colmap_io.tables import MAX_NUM_IMAGES, DatabaseTables
+from colmap_vg.colmap_io.tables import MAX_NUM_IMAGES, UNDEFINED, DatabaseTables
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+_MATRICES = ("E", "F", "H", "rotations", "translations")
 
 
 def raw_matches(connection: sqlite3.Connection, tables: DatabaseTables, pair: tuple[int, int]) -> IntArray | None:
@@ -36,11 +39,49 @@ def with_raw_matches(tables: DatabaseTables, database_path: str | PathLike[str],
             i, j = tables.pairs[row].tolist()
             raw = raw_matches(connection, tables, (i, j))
             kept[row] = kept[row] if raw is None else raw
-    matrices = {name: getattr(tables, name).copy() for name in ("E", "F", "H", "rotations", "translations")}
+    matrices = {name: getattr(tables, name).copy() for name in _MATRICES}
     for matrix in matrices.values():
         matrix[marked] = np.nan
     offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
     return replace(tables, matches=np.concatenate(kept), offsets=offsets, **matrices)
+
+
+def with_unverified_pairs(
+    tables: DatabaseTables, database_path: str | PathLike[str], images: BoolArray, min_num_matches: int
+) -> DatabaseTables:
+    """Add the pairs of marked images (n,) for which COLMAP found no geometry, with their matches before verification.
+
+    Their configuration is `UNDEFINED`, their matrices are NaN. Pairs that were never verified are not added.
+    """
+    row_of = {int(image_id): row for row, image_id in enumerate(tables.image_ids)}
+    pairs, matches = [], []
+    with reading(database_path) as connection:
+        without = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows = 0 ORDER BY pair_id")
+        for (pair_id,) in without.fetchall():
+            pair = row_of.get(pair_id // MAX_NUM_IMAGES, -1), row_of.get(pair_id % MAX_NUM_IMAGES, -1)
+            if min(pair) < 0 or not images[list(pair)].all():
+                continue
+            raw = raw_matches(connection, tables, pair)
+            if raw is not None and len(raw) >= min_num_matches:
+                pairs.append(pair)
+                matches.append(raw)
+    if not pairs:
+        return tables
+    every = [tables.matches[a:b] for a, b in zip(tables.offsets[:-1], tables.offsets[1:], strict=True)] + matches
+    joined = np.concatenate([tables.pairs, np.array(pairs, dtype=np.int64)])
+    order = np.lexsort((joined[:, 1], joined[:, 0]))
+    matrices: dict[str, Any] = {
+        name: np.concatenate([(old := getattr(tables, name)), np.full((len(pairs), *old.shape[1:]), np.nan)])[order]
+        for name in _MATRICES
+    }
+    return replace(
+        tables,
+        pairs=joined[order],
+        configs=np.concatenate([tables.configs, np.full(len(pairs), UNDEFINED)])[order],
+        matches=np.concatenate([every[row] for row in order]),
+        offsets=np.concatenate([[0], np.cumsum([len(every[row]) for row in order])]).astype(np.int64),
+        **matrices,
+    )
 
 
 def compared_pairs(database_path: str | PathLike[str]) -> IntArray:

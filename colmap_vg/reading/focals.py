@@ -7,7 +7,7 @@ lengths that make it essential.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,7 +59,10 @@ class FocalDecision:
 
 
 def decide_focal_lengths(
-    tables: DatabaseTables, options: ReadOptions, calibrated: BoolArray | None = None
+    tables: DatabaseTables,
+    options: ReadOptions,
+    calibrated: BoolArray | None = None,
+    estimated: BoolArray | None = None,
 ) -> FocalDecision:
     """Decide for each camera whether its focal length is kept, and by what factor it is changed otherwise.
 
@@ -69,20 +72,25 @@ def decide_focal_lengths(
     options : ReadOptions
     calibrated : (c,) bool array, optional
         Cameras that keep their focal length in any case, as those of a given model.
+    estimated : (c,) bool array, optional
+        Cameras whose focal length was estimated before, and which keep it, though it is not known.
 
     Returns
     -------
     FocalDecision
     """
     calibrated = np.zeros(len(tables.cameras), dtype=bool) if calibrated is None else calibrated
-    if calibrated.all():
-        return FocalDecision(np.ones(len(calibrated)), np.ones(len(calibrated), dtype=bool), ())
+    estimated = np.zeros(len(tables.cameras), dtype=bool) if estimated is None else estimated
+    kept = calibrated | estimated
+    if kept.all():
+        return FocalDecision(np.ones(len(kept)), ~estimated, ())
     # Spherical cameras have no focal length that could be wrong.
     prior = np.array([c.has_prior_focal_length or c.is_spherical() for c in tables.cameras], dtype=bool)
     as_given = np.ones(len(prior))
     if options.trust_focal_lengths == "always":
         return FocalDecision(as_given, np.ones(len(prior), dtype=bool), _contradictions(tables, options))
-    return _voted(tables, prior, calibrated, options)
+    found = _voted(tables, prior, kept, options)
+    return replace(found, known=found.known & ~estimated)
 
 
 def _contradictions(tables: DatabaseTables, options: ReadOptions) -> tuple[str, ...]:

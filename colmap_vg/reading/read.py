@@ -16,6 +16,7 @@ from colmap_vg.events import report_progress
 from colmap_vg.linear.threads import single_threaded_blas
 from colmap_vg.options import ReadOptions
 from colmap_vg.reading.distortion import with_found_distortion
+from colmap_vg.reading.fisheyes import with_found_fisheye_focals
 from colmap_vg.reading.focals import FocalDecision, decide_focal_lengths
 from colmap_vg.reading.given_model import explained_pairs, of_pairs, with_given_cameras, with_pairs_of_model
 from colmap_vg.reading.relative_poses import relative_poses
@@ -85,14 +86,16 @@ def _read(
     terms = np.zeros(len(tables.cameras))
     if options.find_distortion:
         tables, terms = with_found_distortion(tables, database_path, calibrated)
+    report_progress("focal lengths")
+    tables, replaced = with_found_fisheye_focals(tables, database_path, options, calibrated)
     report_progress("still background")
     tables, thinned = without_still_background(tables, database_path)
     report_progress("verification")
-    expected = thinned | (terms != 0.0)[tables.camera_idx[tables.pairs]].any(axis=1)
+    expected = thinned | (replaced | (terms != 0.0))[tables.camera_idx[tables.pairs]].any(axis=1)
     tables, changed = with_verified_geometries(tables, options.random_seed, expected)
     changed |= thinned
     report_progress("focal lengths")
-    focals = decide_focal_lengths(tables, options, calibrated)
+    focals = decide_focal_lengths(tables, options, calibrated, replaced)
     report_progress("relative poses")
     return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
 

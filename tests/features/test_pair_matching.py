@@ -205,3 +205,11 @@ def test_verification_tries_little_and_leaves_its_options_as_they_are(monkeypatc
         assert trials == MIN_TRIALS < before["ransac"]["min_num_trials"]
         assert ratio == max(0.05, options.min_num_inliers / count)
     assert seen[0][2] > 0.05
+
+
+def test_a_fisheye_without_a_focal_length_is_verified() -> None:
+    lens = pycolmap.Camera(model="SIMPLE_FISHEYE", width=1200, height=900, params=[1440.0, 600.0, 450.0])
+    found = pair(0, lens=lens).matched()
+    inliers = np.asarray(found.geometry.inlier_matches)
+    assert found.geometry.config == pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+    assert len(inliers) > 0.5 * NUM_LARGE

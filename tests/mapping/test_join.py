@@ -10,7 +10,9 @@ from colmap_vg import read_view_graph
 from colmap_vg.mapping.join import joint_of
 
 
-@pytest.mark.parametrize(("first", "second"), [(range(1, 6), range(6, 11)), (range(1, 7), range(5, 11)), (range(5, 11), range(1, 7))])
+@pytest.mark.parametrize(
+    ("first", "second"), [(range(1, 6), range(6, 11)), (range(1, 7), range(5, 11)), (range(5, 11), range(1, 7))]
+)
 def test_models_that_share_no_or_some_images_have_a_joint(first: range, second: range, tmp_path: Path) -> None:
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=10, num_points3D=60)
