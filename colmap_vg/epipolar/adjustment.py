@@ -43,6 +43,9 @@ _MAX_RADIAL_STEP = 0.1  # change of the radial term per step
 _MAX_LOG_FOCAL = np.log(3.0)  # beyond it a focal length has diverged; errors vanish with the focal length
 MAX_RADIAL_TERM = 0.6
 """Largest absolute value of the radial term, at the focal lengths of the problem; beyond it the term has diverged."""
+START_SIGMAS = 3.0
+"""Limit of the scales, in robust standard deviations of the matches' errors at their start. Where the camera moved
+little, a wider loss takes in false matches, whose errors are as large as the parallax of the others."""
 _MIN_SIGMA_PX = 0.05  # pixels; below the noise of any keypoints, and keeps the scale of exact data finite
 
 
@@ -175,7 +178,7 @@ def adjust_epipolar(
     initial_lenses : Lenses, optional
         Default: the problem's focal lengths, without distortion.
     scales_px : tuple of float
-        Successive Cauchy scales, pixels.
+        Upper limits of successive Cauchy scales, pixels, see `START_SIGMAS`.
     final_sigmas : float
         Last Cauchy scale, in robust standard deviations of the matches' errors, if that is below the previous one:
         false matches with errors of a pixel would bias a result that is accurate to a quarter of it. 0 omits it.
@@ -228,7 +231,7 @@ def _in_stages(
     for stage in range(num_stages):
         last = stage + 1 == num_stages
         if stage < len(scales_px):
-            scale = scales_px[stage]
+            scale = min(scales_px[stage], max(START_SIGMAS * _sigma(problem, cameras), _MIN_SIGMA_PX))
         else:
             scale = min(scale, max(final_sigmas * _sigma(problem, cameras), _MIN_SIGMA_PX))
         end = tolerance if last else _EARLY_TOLERANCE * tolerance

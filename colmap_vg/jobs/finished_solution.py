@@ -68,7 +68,7 @@ def solution_of_models(
     if contradicted:
         in_doubt = (False if in_doubt is None else in_doubt) | np.isin(solution.image_ids, contradicted)
     doubtful = in_doubt is not None or any(result.folded for result in results)
-    status, message = described(words, solution.converged, agreement, doubtful)
+    status, message = described(words, solution.converged, agreement, doubtful, solution.uncertain is not None)
     return replace(
         solution,
         position_covariances=_covariances_in_models(solution, centers, component),

@@ -328,7 +328,13 @@ def _second_opinion(
                 "The points confirm the arrangement that is used: its images see a share of"
                 f" {found[0].share_seen:.2f} of the points that they should see."
             )
-        status, message = described(chosen.image_verdicts, chosen.converged, chosen.agreement, in_doubt is not None)
+        status, message = described(
+            chosen.image_verdicts,
+            chosen.converged,
+            chosen.agreement,
+            in_doubt is not None,
+            chosen.uncertain is not None,
+        )
         return replace(chosen, in_doubt=in_doubt, status=status, message=message)
 
 

@@ -101,6 +101,8 @@ class PoseSolution:
         Agreement of each component with its pairs.
     in_doubt : (n,) bool array or None
         Images whose pose differs in another arrangement that nearly as many matches agree with; None without one.
+    uncertain : (n,) bool array or None
+        Images of parts whose positions are hardly known, since the camera moved too little; None without any.
     arrangements : tuple of (n, 3, 3) arrays
         Averaged cam_from_world rotations of the solved arrangement and of alternatives: the one above, and the one from
         each image's strongest pairs. NaN outside the part concerned. Empty without alternatives.
@@ -127,5 +129,6 @@ class PoseSolution:
     edge_residual_sigmas: Array | None = None
     agreement: tuple[Agreement, ...] = ()
     in_doubt: NDArray[np.bool_] | None = None
+    uncertain: NDArray[np.bool_] | None = None
     arrangements: tuple[Array, ...] = ()
     log: tuple[LogEntry, ...] = field(default=())

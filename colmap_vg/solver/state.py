@@ -56,6 +56,7 @@ class SolverState:
         self._converged = True
         self._covariances: Array | None = None
         self._in_doubt: BoolArray | None = None
+        self._uncertain: BoolArray | None = None
         self._arrangements: list[Array] = []
         self._ratios = np.zeros((0, 2), dtype=np.int64)
 
@@ -89,6 +90,13 @@ class SolverState:
         if self._in_doubt is None:
             self._in_doubt = np.zeros(self.graph.num_images, dtype=bool)
         self._in_doubt[images] = True
+        self.caveats.append(reason)
+
+    def note_uncertain(self, images: IntArray, reason: str) -> None:
+        """Mark images whose positions are hardly known, with the reason as a sentence."""
+        if self._uncertain is None:
+            self._uncertain = np.zeros(self.graph.num_images, dtype=bool)
+        self._uncertain[images] = True
         self.caveats.append(reason)
 
     def remove_images(self, part: Subgraph, verdict: ImageVerdict) -> None:
@@ -222,7 +230,8 @@ class SolverState:
         self.edge_verdicts[(self.edge_verdicts == EdgeVerdict.KEPT) & ~inside] = EdgeVerdict.OUTSIDE
         agreement = pair_agreement(self.graph, self._R, self._p, component)
         in_doubt = self._in_doubt is not None and bool((self._in_doubt & (component >= 0)).any())
-        status, message = described(self.image_verdicts, self._converged, agreement, in_doubt)
+        uncertain = self._uncertain is not None and bool((self._uncertain & (component == 0)).any())
+        status, message = described(self.image_verdicts, self._converged, agreement, in_doubt, uncertain)
         still = int((self.edge_verdicts == EdgeVerdict.ROTATION_ONLY).sum())
         if status == SolutionStatus.UNSOLVABLE and still:
             message += f" In {still} of {self.graph.num_edges} pairs the camera seems to have rotated without moving."
@@ -246,13 +255,18 @@ class SolverState:
             edge_residual_sigmas=graph_residual_sigmas(self.graph, self._R, self._p, component),
             agreement=agreement,
             in_doubt=self._in_doubt if in_doubt else None,
+            uncertain=self._uncertain if uncertain else None,
             arrangements=tuple(self._arrangements),
             log=tuple(self.log),
         )
 
 
 def described(
-    image_verdicts: NDArray[np.generic], converged: bool, agreement: tuple[Agreement, ...], in_doubt: bool
+    image_verdicts: NDArray[np.generic],
+    converged: bool,
+    agreement: tuple[Agreement, ...],
+    in_doubt: bool,
+    uncertain: bool,
 ) -> tuple[SolutionStatus, str]:
     """Status of a solution, and the message that explains it."""
     words, counts = np.unique(image_verdicts.astype(str), return_counts=True)
@@ -281,6 +295,9 @@ def described(
             f" The model is doubtful: {why}. Look at it, exclude pairs that are wrong, or add photographs between the"
             " views that look alike."
         )
+    if uncertain:
+        status = SolutionStatus.DOUBTFUL
+        message += " The positions are hardly known: move the camera more between the photographs."
     return status, message
 
 

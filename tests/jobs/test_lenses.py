@@ -8,8 +8,9 @@ import pytest
 from lens_rooms import NUM_IMAGES, WIDTH, camera, write_room
 from synthetic_databases import centers, make_database
 
-from colmap_vg import MappingOptions, ReadOptions, align_positions, read_view_graph, solve_view_graph
+from colmap_vg import MappingOptions, ReadOptions, SolutionStatus, align_positions, read_view_graph, solve_view_graph
 from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
+from colmap_vg.errors import MappingError
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.reading.distortion import undistorted
@@ -186,3 +187,21 @@ def test_pixels_that_are_not_square_are_found_without_a_prior(noise_px: float, t
     assert ids == list(range(1, NUM_IMAGES + 1))
     errors, _ = align_positions(centers(found, ids), truth)
     assert errors.mean() < 0.01 * 1.5
+
+
+@pytest.mark.parametrize(("moved", "noise_px", "doubtful"), [(0.04, 0.5, True), (0.04, 0.0, False), (0.4, 0.5, False)])
+def test_a_camera_on_a_tripod_is_doubted(moved: float, noise_px: float, doubtful: bool, tmp_path: Path) -> None:
+    lens = camera("SIMPLE_PINHOLE", (600.0, 600.0, 450.0))
+    truth = write_room(tmp_path / "a.db", lens, lens, noise_px, tripod=moved)
+    solution = solve_view_graph(read_view_graph(tmp_path / "a.db"))
+    seen = solution.registered
+    errors, _ = align_positions(solution.projection_centers[seen], truth[seen])
+    assert (errors.mean() > 0.04 * moved) == doubtful
+    assert (solution.status == SolutionStatus.DOUBTFUL) == doubtful
+    assert (solution.uncertain is not None and solution.uncertain[seen].all()) == doubtful
+    assert any("moved too little" in caveat for caveat in solution.caveats) == doubtful
+    assert ("The positions are hardly known" in solution.message) == doubtful
+    assert solution.position_covariances is None
+    if moved < 0.1:  # under a degree no point is triangulated
+        with pytest.raises(MappingError, match="sufficient triangulation angle"):
+            map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(num_threads=1), StageLog())

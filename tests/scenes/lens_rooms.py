@@ -10,13 +10,24 @@ WIDTH, HEIGHT, NUM_IMAGES = 1200, 900, 14
 
 
 def write_room(
-    path: Path, lens: pycolmap.Camera, stored: pycolmap.Camera, noise_px: float = 0.5, seed: int = 0
+    path: Path,
+    lens: pycolmap.Camera,
+    stored: pycolmap.Camera,
+    noise_px: float = 0.5,
+    seed: int = 0,
+    tripod: float | None = None,
 ) -> np.ndarray:
-    """A walk in a room with one lens, pairs verified by pycolmap under the calibration that is stored; the centres."""
+    """A walk in a room with one lens, pairs verified by pycolmap under the calibration that is stored; the centres.
+
+    On a tripod the camera turns about itself in the middle, and moves by some metres at random.
+    """
     rng = np.random.default_rng(seed)
     turn = 2.0 * np.pi * np.arange(NUM_IMAGES) / NUM_IMAGES
     p = np.stack([1.5 * np.cos(turn), 0.15 * rng.standard_normal(NUM_IMAGES), 1.5 * np.sin(turn)], axis=1)
     targets = np.stack([-4.0 * np.cos(turn + 0.2), np.zeros(NUM_IMAGES), -4.0 * np.sin(turn + 0.2)], axis=1)
+    if tripod is not None:
+        p = tripod / np.sqrt(3.0) * rng.standard_normal((NUM_IMAGES, 3))
+        targets = p + np.stack([np.cos(turn), 0.1 * rng.standard_normal(NUM_IMAGES), np.sin(turn)], axis=1)
     wall, X = rng.integers(6, size=900), rng.uniform(-1.0, 1.0, (900, 3))
     X[np.arange(900), wall // 2] = np.where(wall % 2 == 0, 1.0, -1.0)
     X *= np.array([4.0, 2.0, 4.0]) * rng.uniform(0.9, 1.0, (900, 1))

@@ -29,7 +29,7 @@ def test_tracks_are_sought_again_where_the_dropped_pair_held_an_image(tmp_path: 
     write_scene(tmp_path / "a.db", poses, points, pairs, seed=3)
     graph = read_view_graph(tmp_path / "a.db")
     row = int(np.flatnonzero((graph.edges == [wrong, last]).all(axis=1))[0])
-    graph = turned(graph, row, 3.0, with_matches=True)
+    graph = turned(graph, row, 5.0, with_matches=True)
     state = SolverState(graph)
     everything = np.ones(NUM_IMAGES, dtype=bool), np.ones(graph.num_edges, dtype=bool)
     part = Subgraph.of(graph.edges, *everything)
