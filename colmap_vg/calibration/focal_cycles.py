@@ -31,6 +31,7 @@ _FINE_STEPS = (0.06, 0.02)  # log factor; steps of the two finer grids, about a 
 _NUM_FINE = 3  # values of a finer grid on each side of the minimum
 _MATCHES_PER_PAIR = 100
 _NUM_STEPS = 6  # Levenberg-Marquardt steps; the nearest essential matrix is within a few standard deviations
+_NUM_COARSE_STEPS = 3  # on the coarse grid, whose neighbours differ by far more
 _MODEL_SIGMA = 1e-3  # radians; error of the lens model and correlation of keypoints, beside the noise of the matches
 _AVERAGING_SIGMA_DEG = 2.0  # degrees; scale of the robust rotation averaging
 _SIDE = np.log(1.25)  # log factor at which the rise of the cost is measured
@@ -116,11 +117,11 @@ def vote_focal_by_rotation_cycles(
     CycleVote
     """
 
-    def cost(log_factor: float) -> float:
+    def cost(log_factor: float, num_steps: int = _NUM_STEPS) -> float:
         focal = unit_focal_lengths * np.where(estimated, np.exp(log_factor), 1.0)
-        return _cycle_cost(pairs, focal, focal * aspect_ratios, principal_points)
+        return _cycle_cost(pairs, focal, focal * aspect_ratios, principal_points, num_steps)
 
-    curve = {float(x): cost(float(x)) for x in _COARSE_LOG_FACTORS}
+    curve = {float(x): cost(float(x), _NUM_COARSE_STEPS) for x in _COARSE_LOG_FACTORS}
     for step in _FINE_STEPS:
         center = min(curve, key=lambda x: curve[x])
         around = center + step * np.arange(-_NUM_FINE, _NUM_FINE + 1)
@@ -222,7 +223,9 @@ def select_cycle_pairs(
     )
 
 
-def _cycle_cost(pairs: CyclePairs, focal_x: Array, focal_y: Array, principal_points: Array) -> float:
+def _cycle_cost(
+    pairs: CyclePairs, focal_x: Array, focal_y: Array, principal_points: Array, num_steps: int = _NUM_STEPS
+) -> float:
     calibration = np.zeros((len(focal_x), 3, 3))
     calibration[:, 0, 0], calibration[:, 1, 1], calibration[:, 2, 2] = focal_x, focal_y, 1.0
     calibration[:, :2, 2] = principal_points
@@ -242,7 +245,7 @@ def _cycle_cost(pairs: CyclePairs, focal_x: Array, focal_y: Array, principal_poi
         poses.directions,
         focal_x[first],
         focal_x[second],
-        num_iterations=_NUM_STEPS,
+        num_iterations=num_steps,
     )
     # Unobservable parameters get a standard deviation of a radian instead of an infinite one.
     covariance = np.linalg.inv(refined.information + np.eye(5))[:, :3, :3]

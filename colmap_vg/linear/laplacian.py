@@ -16,6 +16,10 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+FACTORED_BELOW = 150
+"""Number of nodes up to which a new factorisation is faster than conjugate gradients with an old one."""
+
+
 class LaplacianSystem:
     """Matrices ``B^T diag(w) B`` and right sides ``B^T diag(w) d`` of a graph with incidence matrix B.
 
@@ -111,7 +115,7 @@ class ReweightedLaplacian:
         # Grounding one node makes the matrix definite and keeps the solution: for columns of sum zero, x_0 = 0.
         A = self.matrix(weights, ground=1.0)
         x = None
-        if self._factor is not None:
+        if self._factor is not None and self.num_nodes > FACTORED_BELOW:
             x = conjugate_gradients(A, b, self._factor, relative_tolerance, self._max_cg_iterations)
         if x is None:
             self._factor = None  # frees the old factorisation before the new one is computed
