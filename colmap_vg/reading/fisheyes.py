@@ -114,7 +114,7 @@ def with_found_fisheye_focals(
             f" {cameras[rows[0]].mean_focal_length():.1f} px, and {before:.0%} the {camera.mean_focal_length():.1f} px"
             " of the database. It is the initial focal length, and the pairs are verified again with it."
         )
-    if not caveats and not len(as_read.pairs):
+    if unknown.any() and not caveats and not len(as_read.pairs):
         raise DatabaseError(
             f"{database_path}: COLMAP verifies no pair of fisheye cameras without a focal length, and the matches do"
             " not determine it; give the cameras their focal length, and verify the matches again"

@@ -18,6 +18,7 @@ from colmap_vg.errors import DatabaseError
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.reading import fisheyes
+from colmap_vg.reading.given_model import of_pairs
 
 DISTORTIONS: dict[str, tuple[float, ...]] = {
     "SIMPLE_FISHEYE": (),
@@ -101,6 +102,14 @@ def test_a_given_calibration_is_kept_though_it_is_wrong(tmp_path: Path) -> None:
     assert not found.cameras[0].has_prior_focal_length
     assert tables.cameras[0].mean_focal_length() == 1000.0
     assert np.isnan(found.E).all()
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "SIMPLE_FISHEYE"])
+def test_tables_without_pairs_are_returned(model: str, tmp_path: Path) -> None:
+    lens = camera(model, (700.0, 600.0, 450.0))
+    write_room(tmp_path / "a.db", lens, lens)
+    tables = of_pairs((whole := read_tables(tmp_path / "a.db")), np.zeros(len(whole.pairs), dtype=bool))
+    assert fisheyes.with_found_fisheye_focals(tables, tmp_path / "a.db", ReadOptions())[0] is tables
 
 
 def test_fisheyes_of_which_nothing_can_be_told_are_refused(tmp_path: Path) -> None:
