@@ -14,6 +14,7 @@ from colmap_vg.errors import MappingError
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.reading.distortion import undistorted
+from colmap_vg.solver import adjustment_stage
 
 LENSES = {
     "SIMPLE_RADIAL": (450.0, 600.0, 450.0, -0.1),
@@ -187,6 +188,16 @@ def test_pixels_that_are_not_square_are_found_without_a_prior(noise_px: float, t
     assert ids == list(range(1, NUM_IMAGES + 1))
     errors, _ = align_positions(centers(found, ids), truth)
     assert errors.mean() < 0.01 * 1.5
+
+
+def test_uncertain_positions_stay_doubtful_in_finished_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = camera("SIMPLE_PINHOLE", (600.0, 600.0, 450.0))
+    write_room(tmp_path / "a.db", lens, lens)
+    monkeypatch.setattr(adjustment_stage, "SMALL_ANGLE_DEG", 180.0)
+    monkeypatch.setattr(adjustment_stage, "MAX_POSITION_SIGMA", 0.0)
+    result = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(num_threads=1), StageLog())
+    assert len(result.models[0].reg_image_ids()) == NUM_IMAGES
+    assert result.solution.status == SolutionStatus.DOUBTFUL
 
 
 @pytest.mark.parametrize(("moved", "noise_px", "doubtful"), [(0.04, 0.5, True), (0.04, 0.0, False), (0.4, 0.5, False)])

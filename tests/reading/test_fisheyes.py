@@ -2,6 +2,7 @@
 
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from colmap_vg.errors import DatabaseError
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.reading import fisheyes
+from colmap_vg.reading.fisheyes import FOCALS_OVER_SIZE
+from colmap_vg.reading.focals import decide_focal_lengths
 from colmap_vg.reading.given_model import of_pairs
 
 DISTORTIONS: dict[str, tuple[float, ...]] = {
@@ -102,6 +105,71 @@ def test_a_given_calibration_is_kept_though_it_is_wrong(tmp_path: Path) -> None:
     assert not found.cameras[0].has_prior_focal_length
     assert tables.cameras[0].mean_focal_length() == 1000.0
     assert np.isnan(found.E).all()
+
+
+def test_false_matches_that_were_not_verified_do_no_harm(tmp_path: Path) -> None:
+    guess = fisheye("SIMPLE_FISHEYE", 1.2 * WIDTH, bent=False, prior=False)
+    write(tmp_path / "a.db", "SIMPLE_FISHEYE", 60, guess)
+    rng = np.random.default_rng(0)
+    with closing(sqlite3.connect(tmp_path / "a.db")) as connection, connection:
+        for pair_id, data in connection.execute("SELECT pair_id, data FROM matches").fetchall():
+            matches = np.frombuffer(data, dtype=np.uint32).reshape(-1, 2).copy()
+            wrong = np.flatnonzero(rng.random(len(matches)) < 0.4)
+            matches[wrong, 1] = rng.permutation(matches[wrong, 1])
+            connection.execute("UPDATE matches SET data = ? WHERE pair_id = ?", (matches.tobytes(), pair_id))
+    found = read_view_graph(tmp_path / "a.db").camera_focal_lengths[0]
+    assert found == pytest.approx(true_focal(60), rel=0.02)
+
+
+@pytest.mark.parametrize("true_scale", [0.3, 0.8, 1.0, 1.37])
+@pytest.mark.parametrize("prior", [True, False])
+def test_the_search_ends_where_a_focal_length_votes_for_itself(true_scale: float, prior: bool) -> None:
+    lens = fisheye("SIMPLE_FISHEYE", 1000.0, bent=False, prior=prior)
+    tried = []
+
+    def vote(scale: float) -> fisheyes._Vote:
+        tried.append(scale)
+        far = float(np.log(scale / true_scale))
+        ratio = np.nan if far < -0.6 else -0.3 * far - 0.1 * far * abs(far)
+        return fisheyes._Vote(ratio, max(0.8 - abs(far), 0.1))
+
+    found = fisheyes._found_focal(lens, vote)
+    if prior and true_scale == 1.0:
+        assert found is None
+        assert tried == [1.0]
+        return
+    assert found is not None
+    assert abs(np.log(found[0] / true_scale)) < fisheyes.CONVERGED / 0.3
+    assert found[2] > 0.7
+    assert len(tried) <= 1 + len(fisheyes.FOCALS_OVER_SIZE) + fisheyes.MAX_NUM_STEPS
+
+
+def test_a_vote_just_below_its_focal_length_is_where_it_falls() -> None:
+    # As under the widest lenses, where shorter focal lengths have no rays.
+    lens = fisheye("SIMPLE_FISHEYE", FOCALS_OVER_SIZE[2] * WIDTH, bent=False, prior=False)
+
+    def vote(scale: float) -> fisheyes._Vote:
+        far = float(np.log(scale))
+        return fisheyes._Vote(np.nan if far < -1e-9 else -0.3 * far - 0.001, 0.5)
+
+    found = fisheyes._found_focal(lens, vote)
+    assert found is not None
+    assert abs(np.log(found[0])) < 1e-9
+
+
+def test_an_estimated_focal_length_is_kept_but_not_known(tmp_path: Path) -> None:
+    lens = camera("SIMPLE_PINHOLE", (600.0, 600.0, 450.0))
+    write_room(tmp_path / "a.db", lens, lens)
+    tables = read_tables(tmp_path / "a.db")
+    wrong = camera("SIMPLE_PINHOLE", (700.0, 600.0, 450.0))
+    wrong.camera_id = 2
+    of_camera = (np.arange(NUM_IMAGES) >= NUM_IMAGES // 2).astype(np.int64)
+    tables = replace(tables, cameras=(lens, wrong), camera_idx=of_camera)
+    voted = decide_focal_lengths(tables, ReadOptions())
+    assert abs(voted.scales[1] - 6.0 / 7.0) < 0.02
+    decided = decide_focal_lengths(tables, ReadOptions(), None, np.array([False, True]))
+    assert decided.scales[1] == 1.0
+    assert decided.known.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "SIMPLE_FISHEYE"])

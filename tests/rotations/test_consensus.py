@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from colmap_vg.geometry import so3
-from colmap_vg.rotations.consensus import average_rotations_by_consensus, learned_log_odds
+from colmap_vg.rotations.consensus import _Search, average_rotations_by_consensus, learned_log_odds
 from colmap_vg.rotations.robust import average_rotations_robust
 from colmap_vg.simulation.objects import ObjectNoise, object_scene, symmetric_object_scene
 from colmap_vg.simulation.ring_scenes import ring_scene
@@ -94,3 +94,15 @@ def test_odds_are_learned_by_likelihood_and_never_fall():
     assert odds[order[0]] == 0.0
     assert abs(odds[order[-1]] - np.log(0.91 / 0.09)) < 0.6
     assert np.ptp(learned_log_odds(np.ones(50), rng.random(50) < 0.8)) == 0.0
+
+
+def test_edges_agree_within_the_threshold() -> None:
+    rng = np.random.default_rng(0)
+    R = so3.exp(rng.standard_normal((30, 3)))
+    edges = np.array([(i, j) for i in range(30) for j in range(i)])
+    axes = rng.standard_normal((len(edges), 3))
+    angles = np.radians(rng.uniform(0.0, 10.0, len(edges)))
+    turns = so3.exp(angles[:, None] * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    search = _Search(30, edges, turns @ R[edges[:, 1]] @ np.swapaxes(R[edges[:, 0]], 1, 2), np.ones(len(edges)))
+    search.add(R)
+    np.testing.assert_array_equal(search._agree[0], angles <= np.radians(5.0))
