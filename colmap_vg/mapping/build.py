@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.cameras import focal_length
 from colmap_vg.events import StageLog, report_progress
 from colmap_vg.mapping.bundle import Held, adjust_bundle, held_of
-from colmap_vg.mapping.lenses import reset_diverged_lenses
+from colmap_vg.mapping.lenses import bend_undistorted_fov, reset_diverged_lenses
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
     MIN_TRIANGULATION_ANGLE_DEG,
@@ -89,6 +89,8 @@ def build_model(
     -------
     BuildResult
     """
+    if options.ba_refine_extra_params:
+        bend_undistorted_fov(reconstruction)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
     held = held_of(cache)

@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import pycolmap
 
+from colmap_vg.colmap_io.cameras import is_undistorted
 from colmap_vg.events import StageLog
 from colmap_vg.options import MappingOptions
 
 MAX_SANE_COEFFICIENT = 10.0
 """Distortion coefficient, in the units of COLMAP's camera models, above which it has diverged; real lenses stay far
 below."""
+START_FOV_ANGLE = 0.3
+"""Parameter of FOV cameras without distortion at the start of bundle adjustment, radians: 1 % at 30 degrees."""
 MAX_ASPECT = 1.01
 """Maximum ratio of the focal lengths in x and y for a camera model with a single one."""
 
@@ -22,6 +25,16 @@ _SIMPLER: dict[str, tuple[str, tuple[tuple[int, ...], ...]]] = {
 }
 """For each camera model, a model with fewer coefficients, and for each of its parameters the indices of the full
 model's parameters that it stands for."""
+
+
+def bend_undistorted_fov(reconstruction: "pycolmap.Reconstruction") -> None:
+    """Give FOV cameras without distortion a little, from which bundle adjustment can find theirs.
+
+    Their distortion is even in the parameter: without any, its derivative vanishes and steps are far too large.
+    """
+    for camera in reconstruction.cameras.values():
+        if camera.model_name == "FOV" and is_undistorted(camera):
+            camera.params = [*camera.params[:4].tolist(), START_FOV_ANGLE]
 
 
 def reset_diverged_lenses(

@@ -190,6 +190,22 @@ def test_pixels_that_are_not_square_are_found_without_a_prior(noise_px: float, t
     assert errors.mean() < 0.01 * 1.5
 
 
+@pytest.mark.parametrize(("angle", "factor"), [(0.6, 1.3), (0.6, 1.0), (0.01, 1.0), (0.01, 1.3)])
+def test_the_distortion_of_an_fov_lens_is_found_from_none(angle: float, factor: float, tmp_path: Path) -> None:
+    focal = 600.0 / np.tan(np.radians(30.0))
+    lens = camera("FOV", (focal, focal, 600.0, 450.0, angle))
+    stored = camera("FOV", (factor * focal, factor * focal, 600.0, 450.0, 0.01))
+    truth = write_room(tmp_path / "a.db", lens, stored)
+    log = StageLog()
+    models = map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(num_threads=1), log).models
+    ids = sorted(models[0].reg_image_ids())
+    assert ids == list(range(1, NUM_IMAGES + 1))
+    errors, _ = align_positions(centers(models[0], ids), truth)
+    assert errors.mean() < 0.005 * 1.5
+    assert abs(models[0].camera(1).params[4]) == pytest.approx(angle, abs=0.2)
+    assert not any("distortion coefficients" in warning for warning in log.warnings)
+
+
 def test_uncertain_positions_stay_doubtful_in_finished_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lens = camera("SIMPLE_PINHOLE", (600.0, 600.0, 450.0))
     write_room(tmp_path / "a.db", lens, lens)
