@@ -120,7 +120,7 @@ def has_radial_term(camera: "pycolmap.Camera") -> bool:
 
 def is_bent_by_focal(camera: "pycolmap.Camera") -> bool:
     """Whether undistorted pixels depend on the focal length: those of fisheyes do, however small their distortion."""
-    return "FISHEYE" in camera.model_name
+    return camera.model_name in FISHEYES
 
 
 def is_undistorted(camera: "pycolmap.Camera") -> bool:
@@ -157,6 +157,8 @@ def with_radial_term(camera: "pycolmap.Camera", term: float) -> "pycolmap.Camera
     return copy
 
 
+FISHEYES = {name: int(model) for name, model in pycolmap.CameraModelId.__members__.items() if "FISHEYE" in name}
+"""Numbers of COLMAP's fisheye models by their names."""
 MIN_FOV_ANGLE = 0.01
 """Parameter of COLMAP's FOV camera without distortion, radians."""
 _DISTORTED_BY_POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")

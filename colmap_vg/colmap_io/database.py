@@ -15,8 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.parse import quote
 
-import pycolmap
-
+from colmap_vg.colmap_io.cameras import FISHEYES
 from colmap_vg.errors import DatabaseError
 
 REQUIRED_TABLES = ("cameras", "images", "keypoints", "two_view_geometries")
@@ -86,10 +85,11 @@ def check_database(database_path: str | PathLike[str]) -> None:
 
 def _has_unverified_fisheyes(connection: sqlite3.Connection) -> bool:
     """Whether there are matches of fisheyes without a focal length, of which COLMAP verifies no pair."""
-    fisheyes = [int(model) for name, model in pycolmap.CameraModelId.__members__.items() if "FISHEYE" in name]
     cameras = connection.execute("SELECT model FROM cameras WHERE prior_focal_length = 0").fetchall()
+    if not any(model in FISHEYES.values() for (model,) in cameras):
+        return False
     (num_pairs,) = connection.execute("SELECT COUNT(*) FROM matches WHERE rows > 0").fetchone()
-    return num_pairs > 0 and any(model in fisheyes for (model,) in cameras)
+    return bool(num_pairs > 0)
 
 
 def working_copy(database_path: str | PathLike[str], folder: Path) -> Path:

@@ -3,7 +3,7 @@
 The pixels of a fisheye are undistorted with its focal length. Under a wrong one they are those of no pinhole camera, so
 their fundamental matrices vote for a focal length between the wrong one and the right one. Only the right one is voted
 for by its own pixels: as the assumed focal length grows, the ratio of the vote to it falls through one there. It is
-found on a grid, then by the secant rule.
+bracketed on a grid, then found by false position.
 
 COLMAP verifies no pair of fisheyes without a focal length. Their matches before verification are used.
 """
@@ -114,12 +114,12 @@ def with_found_fisheye_focals(
             f" {cameras[rows[0]].mean_focal_length():.1f} px, and {before:.0%} the {camera.mean_focal_length():.1f} px"
             " of the database. It is the initial focal length, and the pairs are verified again with it."
         )
-    if unknown.any() and not caveats and not len(as_read.pairs):
-        raise DatabaseError(
-            f"{database_path}: COLMAP verifies no pair of fisheye cameras without a focal length, and the matches do"
-            " not determine it; give the cameras their focal length, and verify the matches again"
-        )
     if not caveats:
+        if unknown.any() and not len(as_read.pairs):
+            raise DatabaseError(
+                f"{database_path}: COLMAP verifies no pair of fisheye cameras without a focal length, and the matches"
+                " do not determine it; give the cameras their focal length, and verify the matches again"
+            )
         return as_read, changed
     replaced = replace(tables, cameras=tuple(cameras), caveats=(*tables.caveats, *caveats))
     of_changed = np.asarray(changed[tables.camera_idx[tables.pairs]].any(axis=1))

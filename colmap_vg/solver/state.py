@@ -87,17 +87,19 @@ class SolverState:
 
     def doubt(self, images: IntArray, reason: str) -> None:
         """Mark images whose pose is in doubt, with the reason as a sentence."""
-        if self._in_doubt is None:
-            self._in_doubt = np.zeros(self.graph.num_images, dtype=bool)
-        self._in_doubt[images] = True
+        self._in_doubt = self._marked(self._in_doubt, images)
         self.caveats.append(reason)
 
     def note_uncertain(self, images: IntArray, reason: str) -> None:
         """Mark images whose positions are hardly known, with the reason as a sentence."""
-        if self._uncertain is None:
-            self._uncertain = np.zeros(self.graph.num_images, dtype=bool)
-        self._uncertain[images] = True
+        self._uncertain = self._marked(self._uncertain, images)
         self.caveats.append(reason)
+
+    def _marked(self, before: BoolArray | None, images: IntArray) -> BoolArray:
+        """Mask (n,) of the images marked before and now."""
+        marked = np.zeros(self.graph.num_images, dtype=bool) if before is None else before.copy()
+        marked[images] = True
+        return marked
 
     def remove_images(self, part: Subgraph, verdict: ImageVerdict) -> None:
         """Give the images of a part a verdict, except those that were removed earlier."""

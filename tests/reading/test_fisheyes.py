@@ -144,6 +144,19 @@ def test_the_search_ends_where_a_focal_length_votes_for_itself(true_scale: float
     assert len(tried) <= 1 + len(fisheyes.FOCALS_OVER_SIZE) + fisheyes.MAX_NUM_STEPS
 
 
+@pytest.mark.parametrize("true_scale", [0.7, 0.85, 1.0, 1.2])
+def test_the_place_stays_bracketed_where_votes_jump(true_scale: float) -> None:
+    lens = fisheye("SIMPLE_FISHEYE", 1000.0, bent=False, prior=False)
+
+    def vote(scale: float) -> fisheyes._Vote:
+        far = float(np.log(scale / true_scale))
+        return fisheyes._Vote(float(-np.tanh(60.0 * far)) - 0.6, 0.5)
+
+    found = fisheyes._found_focal(lens, vote)
+    assert found is not None
+    assert abs(np.log(found[0] / true_scale)) < 0.03
+
+
 def test_a_vote_just_below_its_focal_length_is_where_it_falls() -> None:
     # As under the widest lenses, where shorter focal lengths have no rays.
     lens = fisheye("SIMPLE_FISHEYE", FOCALS_OVER_SIZE[2] * WIDTH, bent=False, prior=False)
