@@ -214,11 +214,10 @@ def _file_sizes(reconstruction: "pycolmap.Reconstruction") -> dict[str, int]:
     """Sizes of the files of a model in COLMAP's binary format, bytes; all its numbers have a fixed width."""
     cameras = reconstruction.cameras.values()
     images = [reconstruction.image(image_id) for image_id in reconstruction.reg_image_ids()]
-    points = reconstruction.points3D.values()
     return {
         "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in cameras),
         "images.bin": 8 + sum(73 + len(image.name.encode()) + 24 * image.num_points2D() for image in images),
-        "points3D.bin": 8 + sum(51 + 8 * point.track.length() for point in points),
+        "points3D.bin": 8 + 51 * reconstruction.num_points3D() + 8 * reconstruction.compute_num_observations(),
         "frames.bin": 8 + 84 * reconstruction.num_reg_frames(),
         "rigs.bin": 8 + 16 * reconstruction.num_rigs(),
     }

@@ -159,10 +159,10 @@ def _copy_points(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstructi
         own, theirs = model.image(new_id), given.image(image_id)
         if own.num_points2D() != theirs.num_points2D():
             return 0
-        for place in np.linspace(0, own.num_points2D() - 1, NUM_COMPARED).astype(int).tolist():
-            far = own.point2D(place).xy - theirs.point2D(place).xy
-            if np.abs(far).max() > SAME_KEYPOINT_PX:
-                return 0
+        places = range(0, own.num_points2D(), max(own.num_points2D() // NUM_COMPARED, 1))
+        keypoints, same = ([image.point2D(place).xy for place in places] for image in (own, theirs))
+        if np.abs(np.subtract(keypoints, same)).max(initial=0.0) > SAME_KEYPOINT_PX:
+            return 0
     same_ids = all(image_id == new_id for image_id, new_id in old.items())
     for _, point in sorted(given.points3D.items()):
         track = point.track if same_ids else _renumbered(point.track, old)

@@ -119,12 +119,14 @@ def _sigma(squared: Array) -> float:
 
 def _squared_errors(reconstruction: "pycolmap.Reconstruction", min_track_length: int) -> Array:
     """Squared residuals (k,) of a sample of points, as they would be of known points."""
-    long = [p for _, p in sorted(reconstruction.points3D.items()) if p.track.length() >= min_track_length]
-    if not long:
+    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    lengths = np.array([point.track.length() for point in points], dtype=np.int64)
+    long = np.flatnonzero(lengths >= min_track_length)
+    if not len(long):
         return np.zeros(0)
-    share = min(1.0, NUM_SAMPLED_OBSERVATIONS / sum(p.track.length() for p in long))
+    share = min(1.0, NUM_SAMPLED_OBSERVATIONS / int(lengths[long].sum()))
     rows = np.linspace(0, len(long) - 1, max(round(share * len(long)), 1)).astype(np.int64)
-    sample = Observations.of(reconstruction, [long[row] for row in np.unique(rows).tolist()])
+    sample = Observations.of(reconstruction, [points[row] for row in long[np.unique(rows)].tolist()])
     # A point takes up three of the 2 L coordinates of its track, which reduces their residuals.
     length = np.bincount(sample.point_row)[sample.point_row]
     errors = sample.reprojection_errors(reconstruction) / np.sqrt(np.maximum(1.0 - 1.5 / length, 0.25))

@@ -14,7 +14,6 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_vg.geometry.directions import normalized
 from colmap_vg.mapping.pair_agreement import PairRotations, agreeing_pairs
 from colmap_vg.mapping.visibility import NEAR_DEG, in_frame, sampled_tracks
 from colmap_vg.scene.components import components_by_size
@@ -200,25 +199,27 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     were_compared = np.zeros((n, n), dtype=bool)
     were_compared[rows[:, 0], rows[:, 1]] = were_compared[rows[:, 1], rows[:, 0]] = True
     tracks = sampled_tracks(reconstruction, ids, MAX_NUM_POINTS)
-    point_of_sight, looking = np.nonzero(in_frame(reconstruction, ids, tracks.points))
-    sights = np.concatenate([[0], np.cumsum(np.bincount(point_of_sight, minlength=len(tracks.points)))])
-    seen_point, seeing = np.nonzero(tracks.sees)
-    # Pair each image that sees a point with each image that the point projects into.
-    rows, offsets = rows_of_segments(sights.astype(np.int64), seen_point)
-    beside = segment_of_rows(offsets)
-    tried = were_compared[looking[rows], seeing[beside]]
-    point, image, near = point_of_sight[rows[tried]], looking[rows[tried]], seeing[beside[tried]]
+    # A sight: a point, and an image that sees it or into which it projects.
+    point, image = np.nonzero(tracks.sees | in_frame(reconstruction, ids, tracks.points))
+    sights = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(tracks.points)))]).astype(np.int64)
     centers = np.array([reconstruction.image(i).projection_center() for i in ids])
-    to_image, to_near = centers[image] - tracks.points[point], centers[near] - tracks.points[point]
-    farther = np.log(np.linalg.norm(to_image, axis=1) / np.linalg.norm(to_near, axis=1))
-    to_image, to_near = normalized(to_image), normalized(to_near)
-    alike = np.einsum("ka,ka->k", to_image, to_near) >= np.cos(np.radians(NEAR_DEG))
-    alike &= np.abs(farther) <= np.log(MAX_DISTANCE_RATIO)
-    point, image, near, to_image, to_near = point[alike], image[alike], near[alike], to_image[alike], to_near[alike]
+    rays = centers[image] - tracks.points[point]
+    distance = np.linalg.norm(rays, axis=1)
+    rays /= distance[:, None]
     normals, flat = _normals(reconstruction, tracks.points)
-    facing = np.einsum("ka,ka->k", normals[point], to_image) / np.einsum("ka,ka->k", normals[point], to_near)
-    expected = ~flat[point] | (np.abs(facing - 1.0) <= MAX_FORESHORTENING)
-    return _Expected(point[expected], image[expected], near[expected], tracks.sees[point, image][expected])
+    facing = np.einsum("ka,ka->k", normals[point], rays)
+    # Pair each sight of a point with each image that sees the point.
+    seen = tracks.sees[point, image]
+    seeing = np.flatnonzero(seen)
+    sight, offsets = rows_of_segments(sights, point[seeing])
+    near = seeing[segment_of_rows(offsets)]
+    alike = were_compared[image[sight], image[near]]
+    alike &= np.abs(np.log(distance[sight] / distance[near])) <= np.log(MAX_DISTANCE_RATIO)
+    alike &= ~flat[point[sight]] | (np.abs(facing[sight] / facing[near] - 1.0) <= MAX_FORESHORTENING)
+    sight, near = sight[alike], near[alike]
+    parallel = np.einsum("ka,ka->k", rays[sight], rays[near]) >= np.cos(np.radians(NEAR_DEG))
+    sight, near = sight[parallel], near[parallel]
+    return _Expected(point[sight], image[sight], image[near], seen[sight])
 
 
 def _normals(reconstruction: "pycolmap.Reconstruction", points: Array) -> tuple[Array, BoolArray]:
