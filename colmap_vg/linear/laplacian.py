@@ -74,6 +74,10 @@ class ReweightedLaplacian:
         self._indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         self._factor: Factor | None = None
 
+    def forget(self) -> None:
+        """Drop the factorisation, so that results do not depend on systems solved before."""
+        self._factor = None
+
     def matrix(self, weights: Array, ground: float = 0.0) -> sp.csc_array:
         """Laplacian (n, n) of weights (m,), with `ground` times the first node's degree added to its diagonal entry."""
         off = np.bincount(self._pair, weights=weights, minlength=self._num_pairs)

@@ -18,7 +18,7 @@ from colmap_vg.geometry import quaternions, so3
 from colmap_vg.rotations.alternatives import nearest_alternative
 from colmap_vg.rotations.cycles import closing_shares, rival_share
 from colmap_vg.rotations.refinement import AGREEMENT_DEG, capped_likelihoods, refine_rotations
-from colmap_vg.rotations.robust import average_rotations_robust
+from colmap_vg.rotations.robust import RobustAveraging
 from colmap_vg.rotations.spanning_tree import spanning_tree
 from colmap_vg.rotations.votes import rotations_by_votes
 from colmap_vg.scene.solution import LogEntry
@@ -162,7 +162,7 @@ class _Search:
         self._quaternions = quaternions.from_matrices(relative)
         self._heaviest = cache(self._find_heaviest)
         self._skeleton = self._heaviest(SKELETON_EDGES)
-        self._averaged = np.ones(len(edges), dtype=bool)
+        self.average_by(None)
         self._backbone: Array | None = None
         self._candidates: list[Array] = []
         self._agree: list[BoolArray] = []
@@ -194,7 +194,8 @@ class _Search:
 
     def average_by(self, per_image: int | None) -> None:
         """Average further candidates over the heaviest edges of each image, or over all edges."""
-        self._averaged = np.ones(len(self.edges), dtype=bool) if per_image is None else self._heaviest(per_image)
+        among = np.ones(len(self.edges), dtype=bool) if per_image is None else self._heaviest(per_image)
+        self._averaging = RobustAveraging(self.num_images, self.edges[among], self.relative[among], self._capped[among])
 
     def agree(self) -> bool:
         """Whether all candidates after the first are the same solution."""
@@ -229,11 +230,7 @@ class _Search:
 
     def averaged(self, start: Array | None, *, l1: bool) -> Array:
         """Rotations averaged with capped likelihoods as weights, from a start or from the spanning tree."""
-        return average_rotations_robust(
-            self.num_images,
-            self.edges[self._averaged],
-            self.relative[self._averaged],
-            self._capped[self._averaged],
+        return self._averaging.run(
             start,
             sigma_deg=AGREEMENT_DEG,
             adapt_sigma=False,
@@ -310,13 +307,27 @@ def learned_log_odds(likelihoods: Array, agree: BoolArray) -> Array:
     (m,) array
         Non-decreasing in the likelihood; 0 where less than half of the edges agree.
     """
-    from scipy.optimize import isotonic_regression  # the import takes 0.1 s, which clear graphs do not need
-
     place = np.searchsorted(np.sort(likelihoods), likelihoods)  # equal likelihoods go together
     group = np.minimum(NUM_GROUPS * place // max(len(place), 1), NUM_GROUPS - 1)
     total, right = np.bincount(group, minlength=NUM_GROUPS), np.bincount(group, agree, NUM_GROUPS)
-    share = isotonic_regression((right + 0.5) / (total + 1.0), weights=np.maximum(total, 1e-9)).x[group]
+    share = _never_falling((right + 0.5) / (total + 1.0), np.maximum(total, 1e-9))[group]
     return np.asarray(np.maximum(np.log(share / (1.0 - share)), 0.0))
+
+
+def _never_falling(values: Array, weights: Array) -> Array:
+    """Non-decreasing values (k,) closest to given ones in weighted least squares, by pooling adjacent violators.
+
+    As ``scipy.optimize.isotonic_regression``, whose import takes 0.2 s.
+    """
+    pools: list[tuple[float, float, int]] = []
+    for value, weight in zip(values.tolist(), weights.tolist(), strict=True):
+        size = 1
+        while pools and pools[-1][0] >= value:
+            before, its_weight, its_size = pools.pop()
+            value = (value * weight + before * its_weight) / (weight + its_weight)
+            weight, size = weight + its_weight, size + its_size
+        pools.append((value, weight, size))
+    return np.repeat([value for value, _, _ in pools], [size for _, _, size in pools])
 
 
 def _differ(one: Array, other: Array) -> bool:

@@ -20,7 +20,6 @@ from colmap_vg.rotations.spanning_tree import rotations_from_spanning_tree
 from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 L1_FLOOR = np.radians(0.5)
 """Lower limit of residuals in the L1 weights 1/r, radians: the noise level of good edges."""
@@ -82,23 +81,65 @@ def average_rotations_robust(
     GraphError
         The graph is malformed or disconnected.
     """
-    edges, relative, w = checked_problem(num_images, edges, cam2_from_cam1_rotations, weights)
-    start = checked_initial(num_images, initial)
-    if start is None:
-        start = rotations_from_spanning_tree(num_images, edges, relative, w)
-    if num_images == 1:
-        return RotationResult(start, 0.0, 0, True, ())
-    loop = _Reweighting(num_images, edges, relative, w, start)
-    if max_num_l1_iterations:
-        loop.run(_l1, max_num_l1_iterations, L1_TOLERANCE)
-    loss = _geman_mcclure(np.radians(sigma_deg))
-    converged = loop.run(loss, max_num_iterations, max(tolerance, FIRST_TOLERANCE) if adapt_sigma else tolerance)
-    if adapt_sigma:
-        sigma = max(MIN_SIGMA, SIGMA_PER_QUARTILE * float(np.quantile(loop.angles, 0.25)))
-        loss = _geman_mcclure(min(sigma, np.radians(sigma_deg)))
-        converged = loop.run(loss, max_num_iterations, tolerance)
-    cost = loop.step(loss, relative_tolerance=1e-8)
-    return RotationResult(quaternions.to_matrices(loop.absolute), cost, len(loop.log), converged, tuple(loop.log))
+    return RobustAveraging(num_images, edges, cam2_from_cam1_rotations, weights).run(
+        initial,
+        sigma_deg=sigma_deg,
+        adapt_sigma=adapt_sigma,
+        max_num_l1_iterations=max_num_l1_iterations,
+        max_num_iterations=max_num_iterations,
+        tolerance=tolerance,
+    )
+
+
+class RobustAveraging:
+    """Averaging as :func:`average_rotations_robust`, on a graph that is prepared once for several starts.
+
+    Parameters
+    ----------
+    num_images, edges, cam2_from_cam1_rotations, weights
+        As those of :func:`average_rotations_robust`.
+    """
+
+    def __init__(
+        self,
+        num_images: int,
+        edges: ArrayLike,
+        cam2_from_cam1_rotations: ArrayLike,
+        weights: ArrayLike | None = None,
+    ) -> None:
+        self.num_images = num_images
+        self.edges, self._matrices, self.weights = checked_problem(num_images, edges, cam2_from_cam1_rotations, weights)
+        self.relative = quaternions.from_matrices(self._matrices)
+        self.laplacian = ReweightedLaplacian(num_images, self.edges)
+
+    def run(
+        self,
+        initial: ArrayLike | None = None,
+        *,
+        sigma_deg: float = 5.0,
+        adapt_sigma: bool = True,
+        max_num_l1_iterations: int = 30,
+        max_num_iterations: int = 100,
+        tolerance: float = 1e-4,
+    ) -> RotationResult:
+        """Average from one start, with the options of :func:`average_rotations_robust`."""
+        start = checked_initial(self.num_images, initial)
+        if start is None:
+            start = rotations_from_spanning_tree(self.num_images, self.edges, self._matrices, self.weights)
+        if self.num_images == 1:
+            return RotationResult(start, 0.0, 0, True, ())
+        self.laplacian.forget()
+        loop = _Reweighting(self, start)
+        if max_num_l1_iterations:
+            loop.run(_l1, max_num_l1_iterations, L1_TOLERANCE)
+        loss = _geman_mcclure(np.radians(sigma_deg))
+        converged = loop.run(loss, max_num_iterations, max(tolerance, FIRST_TOLERANCE) if adapt_sigma else tolerance)
+        if adapt_sigma:
+            sigma = max(MIN_SIGMA, SIGMA_PER_QUARTILE * float(np.quantile(loop.angles, 0.25)))
+            loss = _geman_mcclure(min(sigma, np.radians(sigma_deg)))
+            converged = loop.run(loss, max_num_iterations, tolerance)
+        cost = loop.step(loss, relative_tolerance=1e-8)
+        return RotationResult(quaternions.to_matrices(loop.absolute), cost, len(loop.log), converged, tuple(loop.log))
 
 
 Loss = Callable[[Array], tuple[Array, Array]]
@@ -120,12 +161,11 @@ def _geman_mcclure(sigma: float) -> Loss:
 class _Reweighting:
     """State of the iteratively reweighted least squares on absolute rotations."""
 
-    def __init__(self, num_images: int, edges: IntArray, relative: Array, weights: Array, start: Array) -> None:
+    def __init__(self, problem: RobustAveraging, start: Array) -> None:
         self.log: list[LogEntry] = []
         self.absolute = quaternions.from_matrices(start)
-        self._i, self._j = edges[:, 0], edges[:, 1]
-        self._relative, self._weights = quaternions.from_matrices(relative), weights
-        self._laplacian = ReweightedLaplacian(num_images, edges)
+        self._i, self._j = problem.edges[:, 0], problem.edges[:, 1]
+        self._relative, self._weights, self._laplacian = problem.relative, problem.weights, problem.laplacian
         self._residuals, self.angles = self._measure()
 
     def run(self, loss: Loss, max_num_iterations: int, tolerance: float) -> bool:

@@ -5,6 +5,8 @@ that aligns them, and the pair of clusters whose vote has the largest lead is me
 if no other edge connects its clusters, so a false edge, however strong, is outvoted once clusters have formed.
 """
 
+from itertools import chain
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -53,7 +55,8 @@ def rotations_by_votes(
     edges, relative, w = checked_problem(num_images, edges, cam2_from_cam1_rotations, weights)
     if num_images == 1:
         return np.eye(3)[None]
-    voting = w > 0
+    # Heaviest first, so that the rows of a vote's heaviest edges are its smallest.
+    voting = np.argsort(-w, kind="stable")[: np.count_nonzero(w)]
     clusters = _Clusters(num_images, edges[voting], quaternions.from_matrices(relative[voting]), w[voting])
     for _ in range(num_images - 1):
         report_progress("rotations")
@@ -77,13 +80,16 @@ class _Clusters:
         low, high = np.minimum(self._i, self._j), np.maximum(self._i, self._j)
         pairs, row = np.unique(low * num_images + high, return_inverse=True)
         by_vote = np.argsort(row, kind="stable")
-        self._voters = [rows.tolist() for rows in np.split(by_vote, np.cumsum(np.bincount(row))[:-1])]
+        ends = np.cumsum(np.bincount(row)).tolist()
+        # Of each vote the rows of its edges, in pieces as they were before clusters merged.
+        self._voters = [[by_vote[start:end]] for start, end in zip([0, *ends], ends, strict=False)]
         self._clusters_of = np.stack([pairs // num_images, pairs % num_images], axis=1).tolist()
         self._vote_with: list[dict[int, int]] = [{} for _ in range(num_images)]
         for vote, (a, b) in enumerate(self._clusters_of):
             self._vote_with[a][b] = self._vote_with[b][a] = vote
         # Leads of votes; upper bounds where a vote is not fresh.
-        self._lead = np.bincount(row, weights)
+        self._total = np.bincount(row, weights)
+        self._lead = self._total.copy()
         self._fresh = np.zeros(len(pairs), dtype=bool)
         self._turn = np.zeros((4, len(pairs)))
         self._count(np.arange(len(pairs)))
@@ -105,33 +111,36 @@ class _Clusters:
         self._lead[best] = -np.inf
         own, joining = self._vote_with[into], self._vote_with[moved]
         del own[moved], joining[into]
+        both, gone = [], []
         for other, vote in joining.items():
             del self._vote_with[other][moved]
             standing = own.get(other)
             if standing is None:
-                own[other] = self._vote_with[other][into] = standing = vote
+                own[other] = self._vote_with[other][into] = vote
                 self._clusters_of[vote] = [into, other]
             else:
                 self._voters[standing] += self._voters[vote]
-                self._lead[standing] += sum(self._weights[self._voters[vote]].tolist())
-                self._lead[vote] = -np.inf
-            self._fresh[standing] = False
+                both.append(standing)
+                gone.append(vote)
+        self._total[both] += self._total[gone]
+        self._lead[both] += self._total[gone]
+        self._lead[gone] = -np.inf
+        self._fresh[[*joining.values(), *both]] = False
 
     def _votes_to_recount(self, best: int) -> IntArray:
         """Votes to recount: the best, and stale ones whose bounds are more than half of its bound."""
-        if len(self._lead) <= VOTES_PER_BATCH:
-            return np.flatnonzero(~self._fresh & np.isfinite(self._lead))
-        near = np.argpartition(-self._lead, VOTES_PER_BATCH)[:VOTES_PER_BATCH]
-        near = near[~self._fresh[near] & (self._lead[near] > 0.5 * self._lead[best])]
-        return np.union1d(near, best)
+        near = np.flatnonzero(~self._fresh & (self._lead >= 0.5 * self._lead[best]))
+        if len(near) > VOTES_PER_BATCH:
+            near = near[np.argpartition(-self._lead[near], VOTES_PER_BATCH - 1)[:VOTES_PER_BATCH]]
+        return near
 
     def _count(self, votes: IntArray) -> None:
         """Recount votes."""
-        voters = [self._voters[vote] for vote in votes]
-        sizes = np.array([len(v) for v in voters])
-        rows = np.array([row for v in voters for row in v], dtype=np.int64)
+        pieces = [self._voters[vote] for vote in votes.tolist()]
+        sizes = np.array([sum(map(len, each)) for each in pieces])
         run = np.repeat(np.arange(len(votes)), sizes)
-        rows = rows[np.lexsort((rows, -self._weights[rows], run))]
+        first = run * len(self._weights)
+        rows = np.sort(first + np.concatenate(list(chain.from_iterable(pieces)))) - first
         i, j, w = self._i[rows], self._j[rows], self._weights[rows]
         # R_ij = R_j Q R_i^T, where Q rotates the cluster of the second image; that of the first rotates by the inverse.
         q = self.absolute

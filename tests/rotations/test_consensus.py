@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import isotonic_regression
 
 from colmap_vg.geometry import so3
-from colmap_vg.rotations.consensus import _Search, average_rotations_by_consensus, learned_log_odds
+from colmap_vg.rotations.consensus import _never_falling, _Search, average_rotations_by_consensus, learned_log_odds
 from colmap_vg.rotations.robust import average_rotations_robust
 from colmap_vg.simulation.objects import ObjectNoise, object_scene, symmetric_object_scene
 from colmap_vg.simulation.ring_scenes import ring_scene
@@ -94,6 +95,13 @@ def test_odds_are_learned_by_likelihood_and_never_fall():
     assert odds[order[0]] == 0.0
     assert abs(odds[order[-1]] - np.log(0.91 / 0.09)) < 0.6
     assert np.ptp(learned_log_odds(np.ones(50), rng.random(50) < 0.8)) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_values_that_never_fall_are_the_closest(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values, weights = rng.integers(0, 6, 10) / 6.0 + 0.05 * np.arange(10), rng.uniform(0.1, 3.0, 10)
+    np.testing.assert_allclose(_never_falling(values, weights), isotonic_regression(values, weights=weights).x)
 
 
 def test_edges_agree_within_the_threshold() -> None:
