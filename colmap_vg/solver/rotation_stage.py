@@ -111,7 +111,7 @@ def _doubt_rival(state: SolverState, part: Subgraph, found: ConsensusRotations) 
     shown = ", ".join(names[i] for i in images[:5]) + (", ..." if len(images) > 5 else "")
     state.doubt(
         images,
-        "Another arrangement of the images agrees with nearly as many matches: the scene may repeat itself, and the"
+        "Another arrangement of the images agrees with as many matches, or nearly: the scene may repeat itself, and the"
         f" model may be folded. The poses of {len(images)} of {part.num_images} images differ in it ({shown}).",
     )
 
