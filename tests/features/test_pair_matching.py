@@ -126,6 +126,36 @@ def test_verification_obeys_its_options() -> None:
     assert len(pair(0, lens=camera()).matched(options).geometry.inlier_matches) == 0
 
 
+def with_first(scene: Pair, count: int) -> Pair:
+    return Pair(replace(scene.first, largest=np.arange(count)), replace(scene.second, largest=np.arange(count)))
+
+
+def test_few_features_are_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared, nearest = [], pair_matching.mutual_matches
+
+    def mutual_matches(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        compared.append((len(one), len(other)))
+        return nearest(one, other)
+
+    monkeypatch.setattr(pair_matching, "mutual_matches", mutual_matches)
+    monkeypatch.setattr(pair_matching, "NUM_TRIED_FEATURES", 200)
+    scene = pair(0, lens=camera())
+    found = with_first(scene, 1000).matched()
+    assert compared == [(200, 200)]
+    recall, precision = share_right(np.asarray(found.geometry.inlier_matches), range(NUM_LARGE + NUM_SMALL))
+    assert recall > 0.9
+    assert precision > 0.99
+    # Too few inliers, or too few features to leave some: those that are matched first, at once.
+    compared.clear()
+    monkeypatch.setattr(pair_matching, "MIN_TRIED_INLIERS", 201)
+    all_first = with_first(scene, 1000).matched()
+    assert compared == [(200, 200), (1000, 1000)]
+    assert len(all_first.geometry.inlier_matches) > 0.9 * len(found.geometry.inlier_matches)
+    compared.clear()
+    with_first(scene, 200).matched()
+    assert compared == [(200, 200)]
+
+
 def test_features_that_are_large_in_one_image_only_are_matched() -> None:
     scene = pair(5, lens=camera())
     scene.second = replace(scene.second, largest=np.arange(80, NUM_LARGE + 80))
