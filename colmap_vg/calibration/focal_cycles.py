@@ -28,6 +28,7 @@ BoolArray = NDArray[np.bool_]
 
 _COARSE_LOG_FACTORS = np.linspace(np.log(0.4), np.log(4.5), 15)  # steps of 19 %
 _FINE_STEPS = (0.06, 0.02)  # log factor; steps of the two finer grids, about a third of the step before
+_NEARLY_LOWEST = 1.25  # cost of coarse minima that are looked at closely, over the lowest one; steps left out are 0.1
 _NUM_FINE = 3  # values of a finer grid on each side of the minimum
 _MATCHES_PER_PAIR = 100
 _NUM_STEPS = 6  # Levenberg-Marquardt steps; the nearest essential matrix is within a few standard deviations
@@ -122,10 +123,12 @@ def vote_focal_by_rotation_cycles(
         return _cycle_cost(pairs, focal, focal * aspect_ratios, principal_points, num_steps)
 
     curve = {float(x): cost(float(x), _NUM_COARSE_STEPS) for x in _COARSE_LOG_FACTORS}
+    centers, fine = _lowest_minima(_COARSE_LOG_FACTORS, np.array(list(curve.values()))), dict[float, float]()
     for step in _FINE_STEPS:
-        center = min(curve, key=lambda x: curve[x])
-        around = center + step * np.arange(-_NUM_FINE, _NUM_FINE + 1)
-        curve.update({float(x): cost(float(x)) for x in around if float(x) not in curve})
+        around = (centers[:, None] + step * np.arange(-_NUM_FINE, _NUM_FINE + 1)).ravel()
+        fine.update({float(x): cost(float(x)) for x in around if float(x) not in fine})
+        centers = np.array([min(fine, key=lambda x: fine[x])])
+    curve.update(fine)
     x = np.array(sorted(curve))
     y = np.array([curve[v] for v in x])
     log_factor, lowest = _parabola(x, y)
@@ -264,6 +267,12 @@ def _cycle_cost(
     residual = so3.log(solved @ np.swapaxes(refined.rotations, 1, 2))
     squared = np.einsum("ma,ma->m", residual, residual) * weights
     return float((CAUCHY_SCALE**2 * np.log1p(squared / CAUCHY_SCALE**2)).sum())
+
+
+def _lowest_minima(x: Array, y: Array) -> Array:
+    """Locations of the local minima, ends included, that are nearly as low as the lowest one."""
+    around = np.concatenate([[np.inf], y, [np.inf]])
+    return np.asarray(x[(y <= around[:-2]) & (y <= around[2:]) & (y <= _NEARLY_LOWEST * y.min())])
 
 
 def _parabola(x: Array, y: Array) -> tuple[float, float]:
