@@ -4,10 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from synthetic_databases import make_database, sha256, with_other_ids
 
-from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from_solution
+from colmap_vg.colmap_io.reconstruction import (
+    _file_sizes,
+    loaded_cache,
+    reconstruction_from_solution,
+    write_model,
+)
 from colmap_vg.errors import DatabaseError
 from colmap_vg.reading.read import read_view_graph
 from colmap_vg.scene.solution import PoseSolution
@@ -77,3 +83,14 @@ def test_the_working_copy_goes_even_after_an_error(tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match=r"text\.db"), loaded_cache(tmp_path / "text.db", tmp_path / "work", 15):
         pass
     assert list((tmp_path / "work").iterdir()) == []
+
+
+def test_the_sizes_of_written_files_are_known(tmp_path: Path) -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=5, num_points3D=40))
+    write_model(model, tmp_path)
+    sizes = _file_sizes(model)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (tmp_path / name).stat().st_size == sizes[name]
+    for name, size in sizes.items():
+        assert (tmp_path / name).stat().st_size >= size

@@ -154,6 +154,18 @@ def test_few_features_are_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
     compared.clear()
     with_first(scene, 200).matched()
     assert compared == [(200, 200)]
+    compared.clear()
+    count = NUM_LARGE + NUM_SMALL + NUM_CLUTTER
+    with_first(scene, count).matched()
+    assert compared == [(count, count)]
+
+
+def test_few_features_are_verified_by_the_options_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pair_matching, "NUM_TRIED_FEATURES", 200)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = 10 * (NUM_LARGE + NUM_SMALL)
+    assert len(with_first(pair(0, lens=camera()), 1000).matched(options).geometry.inlier_matches) == 0
+    assert options.min_num_inliers == 10 * (NUM_LARGE + NUM_SMALL)
 
 
 def test_features_that_are_large_in_one_image_only_are_matched() -> None:

@@ -112,6 +112,29 @@ def test_a_model_of_other_keypoints_gives_its_poses_only(scene: Path, tmp_path: 
     assert distances.max() < 1e-3 * radius(centers(joint, names))
 
 
+@pytest.mark.parametrize("shift_px", [0.0, 3.0])
+def test_points_of_a_model_are_copied_if_its_keypoints_are_the_same(
+    scene: Path, tmp_path: Path, shift_px: float
+) -> None:
+    old = pycolmap.Reconstruction(scene / "old" / "0")
+    for image_id in old.reg_image_ids():
+        for keypoint in old.image(image_id).points2D:
+            keypoint.xy = keypoint.xy + shift_px
+    (tmp_path / "given").mkdir()
+    old.write(tmp_path / "given")
+    told: list[str] = []
+    view_graph_mapping(
+        scene / "all.db",
+        None,
+        tmp_path / "out",
+        OPTIONS,
+        lambda e: told.append(e.message),
+        input_path=tmp_path / "given",
+    )
+    copied = old.num_points3D() if shift_px == 0.0 else 0
+    assert any(f"20 images and {copied} points of the given model" in message for message in told)
+
+
 def test_ids_of_the_model_need_not_be_those_of_the_database(scene: Path, tmp_path: Path) -> None:
     """Names are what counts, also for the tracks of its points."""
     old = pycolmap.Reconstruction(scene / "old" / "0")

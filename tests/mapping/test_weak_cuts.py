@@ -129,3 +129,32 @@ def test_walls_are_expected_only_where_they_look_alike() -> None:
     expected = _expected(reconstruction, np.arange(1, 6), every)
     assert np.sum(expected.images == 3) > 500  # of 300 points beside three images
     assert not np.any(expected.images == 4)
+
+
+def test_clouds_are_expected_only_from_alike_angles_and_distances() -> None:
+    """Three images see a cloud; one 8 degrees off should, too, those 20 degrees off or half as far again should not."""
+    cloud = np.random.default_rng(2).uniform(-0.5, 0.5, (300, 3))
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="PINHOLE", width=800, height=800, params=[800.0, 800.0, 400.0, 400.0])
+    camera.camera_id = 1
+    reconstruction.add_camera_with_trivial_rig(camera)
+    places = ((-0.5, 6.0), (0.0, 6.0), (0.5, 6.0), (8.0, 6.0), (20.0, 6.0), (0.0, 9.0))
+    for number, (degrees, distance) in enumerate(places, 1):
+        center = distance * np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
+        image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
+        cam_from_world = look_at(center, np.zeros(3))
+        if number <= 3:
+            image.points2D = [pycolmap.Point2D(np.asarray(camera.img_from_cam(cam_from_world * xyz))) for xyz in cloud]
+        reconstruction.add_image_with_trivial_frame(image, cam_from_world)
+    for row, xyz in enumerate(cloud):
+        track = pycolmap.Track()
+        for number in (1, 2, 3):
+            track.add_element(number, row)
+        reconstruction.add_point3D(xyz, track)
+    every = np.array(list(combinations(range(1, 7), 2)), dtype=np.int64)
+    expected = _expected(reconstruction, np.arange(1, 7), every)
+    of_images = np.bincount(expected.images, minlength=6)
+    assert (of_images[:4] > 300).all()
+    assert (of_images[4:] == 0).all()
+    assert expected.seen[expected.images < 3].all()
+    assert not expected.seen[expected.images == 3].any()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from colmap_vg.geometry import so3
+from colmap_vg.rotations import consensus
 from colmap_vg.rotations.consensus import average_rotations_by_consensus
 from colmap_vg.rotations.near_views import NUM_NEAR_VIEWS, matching_share
 from colmap_vg.simulation.objects import ObjectNoise, object_scene
@@ -59,3 +60,27 @@ def test_missing_pairs_tell_where_a_fold_has_more_consensus(
     errors = np.degrees(so3.angle(np.swapaxes(turns[:, None], 2, 3) @ turns[None])).max(axis=1).min()
     assert errors <= 3.0
     assert found.lead < 1.0 / 3.0
+
+
+@pytest.mark.parametrize(
+    ("shares", "consensuses", "chosen"),
+    [
+        ((0.6, 0.95), (1.0, 0.9), 1),
+        ((0.6, 0.95), (1.0, 0.7), 0),  # too little consensus
+        ((0.9, 0.95), (1.0, 0.9), 0),  # hardly more
+        ((0.5, 0.8), (1.0, 0.9), 0),  # not enough of them match
+        ((0.6, 0.9, 0.95), (1.0, 0.95, 0.9), 2),
+        ((0.6, 0.9, 0.95), (1.0, 0.95, 0.7), 1),
+    ],
+)
+def test_near_views_overrule_consensus_only_where_they_are_clear(
+    shares: tuple[float, ...], consensuses: tuple[float, ...], chosen: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = object_scene(50, 1000, seed=0).graph
+    inliers = graph.num_inliers.astype(float)
+    search = consensus._Search(50, graph.edges, graph.cam2_from_cam1_rotations, inliers)
+    for _ in shares:
+        search.add(np.repeat(np.eye(3)[None], 50, axis=0))
+    given = iter(shares)
+    monkeypatch.setattr(consensus, "matching_share", lambda *_: next(given))
+    assert search._with_its_near_views(0, np.array(consensuses)) == chosen

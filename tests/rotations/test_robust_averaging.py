@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from colmap_vg.errors import GraphError
 from colmap_vg.geometry import quaternions, so3
 from colmap_vg.rotations.chordal import average_rotations_chordal
-from colmap_vg.rotations.robust import average_rotations_robust
+from colmap_vg.rotations.robust import RobustAveraging, average_rotations_robust
 from colmap_vg.scene.edge_residuals import rotation_residuals
 from colmap_vg.simulation.ring_scenes import ring_scene
 
@@ -140,3 +140,14 @@ def test_ellis_island(data_folder):
     errors = np.degrees(_errors(result.cam_from_world_rotations[known], truth[known]))
     assert np.median(errors) < 0.56
     assert errors.mean() < 1.05 * 2.75
+
+
+def test_several_starts_of_one_graph_do_not_depend_on_each_other() -> None:
+    scene = ring_scene(200, rotation_sigma=0.02, seed=5)
+    graph = scene.graph
+    problem = graph.num_images, graph.edges, graph.cam2_from_cam1_rotations
+    other = so3.exp(np.random.default_rng(0).standard_normal((200, 3)))
+    prepared = RobustAveraging(*problem)
+    first, _, again = prepared.run(), prepared.run(other), prepared.run()
+    alone = average_rotations_robust(*problem).cam_from_world_rotations
+    assert first.cam_from_world_rotations.tobytes() == again.cam_from_world_rotations.tobytes() == alone.tobytes()

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_vg.errors import GraphError
-from colmap_vg.geometry import so3
-from colmap_vg.rotations.votes import AGREEMENT_DEG, rotations_by_votes
+from colmap_vg.geometry import quaternions, so3
+from colmap_vg.rotations.votes import AGREEMENT_DEG, NUM_HYPOTHESES, _Clusters, rotations_by_votes
 from colmap_vg.scene.edge_residuals import rotation_residuals
 from colmap_vg.simulation.ring_scenes import ring_scene
 
@@ -100,3 +100,26 @@ def test_one_image_and_parts_apart():
     assert np.array_equal(rotations_by_votes(1, *empty), np.eye(3)[None])
     with pytest.raises(GraphError, match="disconnected"):
         rotations_by_votes(2, *empty)
+
+
+def test_the_heaviest_edges_are_the_hypotheses() -> None:
+    rng = np.random.default_rng(0)
+    num_light, truth = 3 * NUM_HYPOTHESES, so3.exp(np.array([[0.0, 0.5, 0.0]]))
+    relative = np.concatenate([so3.exp(rng.standard_normal((num_light, 3))), np.repeat(truth, 5, axis=0)])
+    weights = np.concatenate([np.full(num_light, 0.1), np.full(5, 1.0)])
+    R = rotations_by_votes(2, np.repeat([[0, 1]], num_light + 5, axis=0), relative, weights)
+    assert np.degrees(so3.angle((R[1] @ R[0].T @ truth[0].T)[None])[0]) < 5.0
+
+
+def test_bounds_of_stale_votes_are_the_weights_of_their_edges() -> None:
+    rng = np.random.default_rng(1)
+    i, j = np.triu_indices(20, 1)
+    chosen = rng.random(len(i)) < 0.5
+    edges, weights = np.stack([i, j], axis=1)[chosen], -np.sort(-rng.uniform(0.1, 2.0, int(chosen.sum())))
+    clusters = _Clusters(20, edges, quaternions.from_matrices(so3.exp(rng.standard_normal((len(edges), 3)))), weights)
+    for _ in range(12):
+        clusters.merge_best()
+        for vote in np.flatnonzero(np.isfinite(clusters._lead)).tolist():
+            rows = np.concatenate(clusters._voters[vote])
+            assert clusters._total[vote] == pytest.approx(weights[rows].sum())
+            assert clusters._lead[vote] <= clusters._total[vote] * (1.0 + 1e-9)
