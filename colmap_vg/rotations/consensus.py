@@ -2,8 +2,9 @@
 
 Robust averaging converges to a local minimum near its start. If nearly half of the edges are false and consistent among
 themselves, that minimum is often a folded model. The candidate with the largest consensus is chosen, where each edge is
-weighted by the log odds that it is correct. These are learned: edges with more inliers are correct more often, but by
-how much depends on the scene. The information of an edge, its precision if it is correct, is used only in the final
+weighted by the log odds that it is correct, unless another one explains far better which images match
+(:mod:`colmap_vg.rotations.near_views`). The log odds are learned: edges with more inliers are correct more often, but
+by how much depends on the scene. The information of an edge, its precision if it is correct, is used only in the final
 refinement within the chosen consensus.
 """
 
@@ -74,15 +75,15 @@ SAME_DEG, SAME_SHARE = 15.0, 0.95
 
 @dataclass(frozen=True, eq=False)
 class ConsensusRotations:
-    """Rotations of largest consensus, with their lead over alternative solutions.
+    """Rotations chosen by consensus and near views, with their lead over alternative solutions.
 
     Attributes
     ----------
     cam_from_world_rotations : (n, 3, 3) array
     lead : float
         Lead over the closest competing solution, as a share of the weight of the edges that agree with exactly one of
-        the two; by likelihoods or by learned log odds, whichever is larger. 1 if there was no other solution, or none
-        was searched for.
+        the two; by likelihoods or by learned log odds, whichever is larger. Negative where near views overrule
+        consensus; 1 if there was no other solution, or none was searched for.
     rival_images : (n,) bool array
         Images whose rotation differs in the closest competing solution.
     rivals : tuple of (n, 3, 3) arrays
@@ -172,6 +173,7 @@ class _Search:
         self._backbone: Array | None = None
         self._candidates: list[Array] = []
         self._agree: list[BoolArray] = []
+        self._matching: list[float] = []  # shares of matching near views, of the candidates that were ranked
 
     def add(self, rotations: Array) -> None:
         """Add a candidate."""
@@ -241,6 +243,7 @@ class _Search:
             sigma_deg=AGREEMENT_DEG,
             adapt_sigma=False,
             max_num_l1_iterations=30 if l1 else 0,
+            max_num_iterations=100,
             tolerance=1e-3,
         ).cam_from_world_rotations
 
@@ -271,10 +274,9 @@ class _Search:
 
     def _with_its_near_views(self, first: int, consensus: Array) -> int:
         """The candidate of largest consensus, or one that explains far better which images match."""
-        shares = [
-            matching_share(self.edges, agree, rotations)
-            for rotations, agree in zip(self._candidates, self._agree, strict=True)
-        ]
+        for row in range(len(self._matching), len(self._candidates)):
+            self._matching.append(matching_share(self.edges, self._agree[row], self._candidates[row]))
+        shares = self._matching
         eligible = np.where(consensus >= MIN_RELATIVE_CONSENSUS * consensus[first], shares, 0.0)
         best = int(np.argmax(eligible))
         return best if shares[best] >= max(MIN_MATCHING_SHARE, shares[first] + MATCHING_LEAD) else first

@@ -21,8 +21,8 @@ NUM_NEAR_VIEWS = 4
 def matching_share(edges: IntArray, agree: BoolArray, cam_from_world_rotations: Array) -> float:
     """Share of the images of nearest viewing directions to which an edge exists that agrees with the rotations.
 
-    It is close to 1 if the images show one object from all sides. Where positions decide what images see, as along a
-    street, it is low for every solution.
+    Of the right solution it was 0.96 to 1 on six of eight sets of photographs, most of one object or building. Where
+    positions decide what images see, as along a street, it is lower for every solution.
 
     Parameters
     ----------

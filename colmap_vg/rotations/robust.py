@@ -116,11 +116,11 @@ class RobustAveraging:
         self,
         initial: ArrayLike | None = None,
         *,
-        sigma_deg: float = 5.0,
-        adapt_sigma: bool = True,
-        max_num_l1_iterations: int = 30,
-        max_num_iterations: int = 100,
-        tolerance: float = 1e-4,
+        sigma_deg: float,
+        adapt_sigma: bool,
+        max_num_l1_iterations: int,
+        max_num_iterations: int,
+        tolerance: float,
     ) -> RotationResult:
         """Average from one start, with the options of :func:`average_rotations_robust`."""
         start = checked_initial(self.num_images, initial)

@@ -100,7 +100,7 @@ class PoseSolution:
     agreement : tuple of Agreement
         Agreement of each component with its pairs.
     in_doubt : (n,) bool array or None
-        Images whose pose differs in another arrangement that nearly as many matches agree with; None without one.
+        Images whose pose differs in another arrangement that as many matches, or nearly, agree with; None without one.
     uncertain : (n,) bool array or None
         Images of parts whose positions are hardly known, since the camera moved too little; None without any.
     arrangements : tuple of (n, 3, 3) arrays

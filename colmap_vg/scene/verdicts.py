@@ -85,7 +85,7 @@ class SolutionStatus(Verdict):
     DOUBTFUL = (
         "doubtful",
         "the model may be folded, or may join two places that look alike: too many pairs contradict it, or another"
-        " arrangement of its images agrees with nearly as many matches",
+        " arrangement of its images agrees with as many matches, or nearly",
     )
     NOT_CONVERGED = "not_converged", "an iteration limit was reached; the poses are the best found"
     UNSOLVABLE = (

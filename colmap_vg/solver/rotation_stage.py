@@ -101,7 +101,7 @@ def _with_gravity(
 
 
 def _doubt_rival(state: SolverState, part: Subgraph, found: ConsensusRotations) -> None:
-    """Record alternative rotations, and mark images in doubt if one agrees with nearly as many matches."""
+    """Record alternative rotations, and mark images in doubt if one agrees with as many matches, or nearly."""
     if found.rivals:
         state.note_arrangements(part, (found.cam_from_world_rotations, *found.rivals))
     if found.lead >= CLEAR_LEAD:

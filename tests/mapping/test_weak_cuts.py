@@ -13,7 +13,7 @@ from colmap_vg import MappingOptions, SolutionStatus
 from colmap_vg.events import StageLog
 from colmap_vg.jobs.bridges import all_bridges
 from colmap_vg.jobs.mapper import MappingResult, map_database
-from colmap_vg.mapping.weak_cuts import WeakCut, _expected, _normals
+from colmap_vg.mapping.weak_cuts import WeakCut, _Expected, _expected, _normals
 
 NUM = 10
 
@@ -105,28 +105,33 @@ def test_normals_are_those_of_walls_and_none_of_clouds() -> None:
     assert _normals(reconstruction, cloud[:200])[1].mean() < 0.1
 
 
-def test_walls_are_expected_only_where_they_look_alike() -> None:
-    """Three images see a wall at 60 degrees; one at 52 should see it, too, and one at 72 sees it far more slanted."""
-    rng = np.random.default_rng(1)
-    wall = np.stack([rng.uniform(-0.5, 0.5, 300), rng.normal(0, 0.002, 300), rng.uniform(-0.5, 0.5, 300)], axis=1)
+def expected_observations(points: np.ndarray, centers: np.ndarray) -> _Expected:
+    """Expected observations of points that the first three of some images see, all of which look at the origin."""
     reconstruction = pycolmap.Reconstruction()
     camera = pycolmap.Camera(model="PINHOLE", width=800, height=800, params=[800.0, 800.0, 400.0, 400.0])
     camera.camera_id = 1
     reconstruction.add_camera_with_trivial_rig(camera)
-    for number, degrees in enumerate((59.5, 60.0, 60.5, 52.0, 72.0), 1):
-        center = 6.0 * np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees)), 0.0])
+    for number, center in enumerate(centers, 1):
         image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
         cam_from_world = look_at(center, np.zeros(3))
         if number <= 3:
-            image.points2D = [pycolmap.Point2D(np.asarray(camera.img_from_cam(cam_from_world * xyz))) for xyz in wall]
+            image.points2D = [pycolmap.Point2D(np.asarray(camera.img_from_cam(cam_from_world * p))) for p in points]
         reconstruction.add_image_with_trivial_frame(image, cam_from_world)
-    for row, xyz in enumerate(wall):
+    for row, xyz in enumerate(points):
         track = pycolmap.Track()
         for number in (1, 2, 3):
             track.add_element(number, row)
         reconstruction.add_point3D(xyz, track)
-    every = np.array(list(combinations(range(1, 6), 2)), dtype=np.int64)
-    expected = _expected(reconstruction, np.arange(1, 6), every)
+    image_ids = np.arange(1, len(centers) + 1)
+    return _expected(reconstruction, image_ids, np.array(list(combinations(image_ids.tolist(), 2)), dtype=np.int64))
+
+
+def test_walls_are_expected_only_where_they_look_alike() -> None:
+    """Three images see a wall at 60 degrees; one at 52 should see it, too, and one at 72 sees it far more slanted."""
+    rng = np.random.default_rng(1)
+    wall = np.stack([rng.uniform(-0.5, 0.5, 300), rng.normal(0, 0.002, 300), rng.uniform(-0.5, 0.5, 300)], axis=1)
+    angles = np.radians([59.5, 60.0, 60.5, 52.0, 72.0])
+    expected = expected_observations(wall, 6.0 * np.stack([np.sin(angles), np.cos(angles), 0.0 * angles], axis=1))
     assert np.sum(expected.images == 3) > 500  # of 300 points beside three images
     assert not np.any(expected.images == 4)
 
@@ -134,25 +139,9 @@ def test_walls_are_expected_only_where_they_look_alike() -> None:
 def test_clouds_are_expected_only_from_alike_angles_and_distances() -> None:
     """Three images see a cloud; one 8 degrees off should, too, those 20 degrees off or half as far again should not."""
     cloud = np.random.default_rng(2).uniform(-0.5, 0.5, (300, 3))
-    reconstruction = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(model="PINHOLE", width=800, height=800, params=[800.0, 800.0, 400.0, 400.0])
-    camera.camera_id = 1
-    reconstruction.add_camera_with_trivial_rig(camera)
-    places = ((-0.5, 6.0), (0.0, 6.0), (0.5, 6.0), (8.0, 6.0), (20.0, 6.0), (0.0, 9.0))
-    for number, (degrees, distance) in enumerate(places, 1):
-        center = distance * np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
-        image = pycolmap.Image(name=f"{number}.jpg", camera_id=1, image_id=number)
-        cam_from_world = look_at(center, np.zeros(3))
-        if number <= 3:
-            image.points2D = [pycolmap.Point2D(np.asarray(camera.img_from_cam(cam_from_world * xyz))) for xyz in cloud]
-        reconstruction.add_image_with_trivial_frame(image, cam_from_world)
-    for row, xyz in enumerate(cloud):
-        track = pycolmap.Track()
-        for number in (1, 2, 3):
-            track.add_element(number, row)
-        reconstruction.add_point3D(xyz, track)
-    every = np.array(list(combinations(range(1, 7), 2)), dtype=np.int64)
-    expected = _expected(reconstruction, np.arange(1, 7), every)
+    angles, distances = np.radians([-0.5, 0.0, 0.5, 8.0, 20.0, 0.0]), np.array([6.0, 6.0, 6.0, 6.0, 6.0, 9.0])
+    directions = np.stack([np.sin(angles), 0.0 * angles, np.cos(angles)], axis=1)
+    expected = expected_observations(cloud, distances[:, None] * directions)
     of_images = np.bincount(expected.images, minlength=6)
     assert (of_images[:4] > 300).all()
     assert (of_images[4:] == 0).all()
