@@ -28,9 +28,7 @@ BoolArray = NDArray[np.bool_]
 
 _COARSE_LOG_FACTORS = np.linspace(np.log(0.4), np.log(4.5), 15)  # steps of 19 %
 _FINE_STEPS = (0.06, 0.02)  # log factor; steps of the two finer grids, about a third of the step before
-_NEARLY_LOWEST = (
-    1.25  # cost of coarse minima that are looked at closely, over the lowest; they differ by 10 % from refined ones
-)
+_NEARLY_LOWEST = 1.25  # coarse minima up to this times the lowest are looked at closely: refinement changes 10 %
 _NUM_FINE = 3  # values of a finer grid on each side of the minimum
 _MATCHES_PER_PAIR = 100
 _NUM_STEPS = 6  # Levenberg-Marquardt steps; the nearest essential matrix is within a few standard deviations
