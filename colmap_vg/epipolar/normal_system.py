@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from colmap_vg.linear.assembly import BlockPattern, sum_at_nodes
+from colmap_vg.linear.assembly import BlockPattern, scattered, sum_at_nodes
 from colmap_vg.linear.solvers import Factor, SingularMatrixError, factorize
 
 Array = NDArray[np.float64]
@@ -148,8 +148,8 @@ class NormalSystem:
         cross, lenses = sp.csc_array((6 * n, u)), sp.csc_array((u, u))
         for term, slot in zip(terms, self._slots, strict=True):
             unknown = (6 * term.images[:, :, None] + np.arange(6)).reshape(len(slot), -1)
-            cross = cross + _scattered(term.cross_blocks, unknown, slot, (6 * n, u))
-            lenses = lenses + _scattered(term.lens_blocks, slot, slot, (u, u))
+            cross = cross + scattered(term.cross_blocks, unknown, slot, (6 * n, u))
+            lenses = lenses + scattered(term.lens_blocks, slot, slot, (u, u))
         level = lenses.diagonal() * damping
         lenses = lenses + sp.diags_array(level + 1e-12 * max(float(lenses.diagonal().max()), 1e-300))
         return sp.csc_array(sp.block_array([[poses, cross], [cross.T, lenses]]))
@@ -170,10 +170,3 @@ def _split(blocks: Array) -> tuple[Array, Array, Array]:
     own = np.concatenate([blocks[:, s, s] for s in parts])
     across = np.concatenate([blocks[:, parts[s], parts[(s + 1) % 3]] for s in range(3)])
     return own, np.zeros_like(own), across
-
-
-def _scattered(blocks: Array, rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> sp.csc_array:
-    """Sum of dense blocks (q, a, b) at rows (q, a) and columns (q, b), ignoring rows and columns -1."""
-    row, column = np.broadcast_to(rows[:, :, None], blocks.shape), np.broadcast_to(columns[:, None, :], blocks.shape)
-    used = (row >= 0) & (column >= 0)
-    return sp.csc_array(sp.coo_array((blocks[used], (row[used], column[used])), shape=shape))

@@ -25,6 +25,13 @@ def sum_at_nodes(num_nodes: int, nodes: IntArray, values: Array) -> Array:
     return np.asarray(out, dtype=np.float64).reshape(num_nodes, *values.shape[1:])
 
 
+def scattered(blocks: Array, rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> sp.csc_array:
+    """Sum of dense blocks (q, a, b) at rows (q, a) and columns (q, b), ignoring rows and columns -1."""
+    row, column = np.broadcast_to(rows[:, :, None], blocks.shape), np.broadcast_to(columns[:, None, :], blocks.shape)
+    used = (row >= 0) & (column >= 0)
+    return sp.csc_array(sp.coo_array((blocks[used], (row[used], column[used])), shape=shape))
+
+
 class BlockPattern:
     """Fixed sparsity pattern of symmetric block matrices with a block for each node and each edge of a graph.
 

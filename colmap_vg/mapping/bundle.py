@@ -1,5 +1,6 @@
 """One round of bundle adjustment, with a robust loss that suits the residuals of the job.
 
+Ceres adjusts rigs, and models that measured positions or kept poses hold; the others take a third of its time here.
 Only tracks of three views or more adjust the cameras, since tracks of two views do not determine a pose and bias it.
 Points of two views are refined afterwards with the cameras fixed.
 """
@@ -12,7 +13,9 @@ import numpy as np
 import pycolmap
 import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
+from colmap_vg.bundle.adjustment import TOLERANCE, TRIAL_TOLERANCE, adjust
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, focal_length
+from colmap_vg.mapping.bundle_problem import ModelProblem, has_rigs
 from colmap_vg.mapping.observations import Observations, keypoint_sigma, loss_scale
 from colmap_vg.mapping.options import MIN_TRACK_LENGTH, bundle_options
 from colmap_vg.mapping.point_refinement import refine_points
@@ -75,6 +78,10 @@ def adjust_bundle(
         Ratio of the final to the initial cost; 1 without observations.
     """
     scale = loss_scale(reconstruction, MIN_TRACK_LENGTH)
+    if not (priors or held.sensors or held.frames) and not has_rigs(reconstruction):
+        ratio = _adjust_freely(reconstruction, options, scale, trial=trial)
+        _move_remaining_points(reconstruction, scale, held)
+        return ratio
     bundle = bundle_options(options, loss_scale_px=scale, trial=trial)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
@@ -105,6 +112,18 @@ def adjust_bundle(
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
+
+
+def _adjust_freely(
+    reconstruction: "pycolmap.Reconstruction", options: MappingOptions, scale_px: float, *, trial: bool
+) -> float:
+    """Adjust a model of single images that nothing holds; return the ratio of the final to the initial cost."""
+    model = ModelProblem.of(reconstruction, options, MIN_TRACK_LENGTH)
+    if model is None:
+        return 1.0
+    found = adjust(model.problem, model.state, scale_px, tolerance=TRIAL_TOLERANCE if trial else TOLERANCE)
+    model.write(found.state, reconstruction)
+    return found.final_cost / found.initial_cost if found.initial_cost > 0.0 else 1.0
 
 
 def _seen_by_others(reconstruction: "pycolmap.Reconstruction", held: Held) -> set[int]:

@@ -4,6 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_vg.bundle.adjustment import TOLERANCE, TRIAL_TOLERANCE, Adjusted
+from colmap_vg.bundle.problem import BundleProblem, BundleState
 from colmap_vg.mapping import build, bundle
 from colmap_vg.mapping.bundle import Held, adjust_bundle
 from colmap_vg.mapping.options import bundle_options
@@ -28,6 +30,21 @@ def with_short_tracks(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
 def test_the_scale_of_the_residuals_and_the_trial_reach_the_adjustment(
     trial: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    asked = []
+
+    def adjusted(problem: BundleProblem, state: BundleState, scale_px: float, *, tolerance: float) -> Adjusted:
+        asked.append((scale_px, tolerance))
+        return Adjusted(state, 4.0, 1.0)
+
+    monkeypatch.setattr(bundle, "loss_scale", lambda *_: 0.37)
+    monkeypatch.setattr(bundle, "adjust", adjusted)
+    pycolmap.set_random_seed(0)
+    assert adjust_bundle(pycolmap.synthesize_dataset(FEW_VIEWS), ONE_THREAD, trial=trial) == 0.25
+    assert asked == [(0.37, TRIAL_TOLERANCE if trial else TOLERANCE)]
+
+
+@pytest.mark.parametrize("trial", [False, True])
+def test_they_reach_ceres_where_frames_are_held(trial: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, scales = [], []
 
     def made(*arguments: object, **named: object) -> pycolmap.BundleAdjustmentOptions:
@@ -42,7 +59,8 @@ def test_the_scale_of_the_residuals_and_the_trial_reach_the_adjustment(
     monkeypatch.setattr(bundle, "bundle_options", made)
     monkeypatch.setattr(bundle, "refine_points", refined)
     pycolmap.set_random_seed(0)
-    adjust_bundle(with_short_tracks(pycolmap.synthesize_dataset(FEW_VIEWS)), ONE_THREAD, trial=trial)
+    model = with_short_tracks(pycolmap.synthesize_dataset(FEW_VIEWS))
+    adjust_bundle(model, ONE_THREAD, trial=trial, held=Held(frames=frozenset([1])))
     assert asked == [{"loss_scale_px": 0.37, "trial": trial}]
     assert scales == [0.37]
 

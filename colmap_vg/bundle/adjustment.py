@@ -1,0 +1,112 @@
+"""Robust bundle adjustment: steps of poses and lenses, after each of which every point is refined alone.
+
+The Cauchy loss is minimised by weights that bound it from above, so each step lowers the cost as far as the residuals
+are linear, up to twice its length (Hunter & Lange, A tutorial on MM algorithms, 2004): steps are lengthened by the
+ratio of the bound's curvature to the cost's. Points are eliminated from the normal equations and refined after each
+step with the poses fixed, which keeps steps long where the points determine the poses loosely (variable projection:
+Golub & Pereyra, Inverse Problems, 2003). It ends where a step is short in the unknowns' own standard deviations.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.bundle.linearization import Linearization, linearize
+from colmap_vg.bundle.point_systems import factored, gradients
+from colmap_vg.bundle.problem import BundleProblem, BundleState
+from colmap_vg.bundle.reduced_system import ReducedPattern, ReducedSystem
+from colmap_vg.events import report_progress
+from colmap_vg.linear.solvers import SingularMatrixError
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 0.1
+"""Root mean square of a step, in standard deviations of the unknowns, at which the adjustment ends."""
+TRIAL_TOLERANCE = 0.5
+"""The same where only the cost is asked for."""
+MAX_NUM_STEPS = 40
+"""Maximum number of steps."""
+FIRST_DAMPING, MAX_DAMPING = 1e-8, 1e4
+"""Damping after the first step that fails, and damping at which no step helps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """An adjusted state, and the costs before and after in pixels squared."""
+
+    state: BundleState
+    initial_cost: float
+    final_cost: float
+
+
+def adjust(
+    problem: BundleProblem,
+    state: BundleState,
+    loss_scale_px: float,
+    *,
+    tolerance: float = TOLERANCE,
+) -> Adjusted:
+    """Adjust poses, lenses and points.
+
+    The gauge is free: it stays near the initial state's.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        With an observation at least.
+    state : BundleState
+        Initial values.
+    loss_scale_px : float
+        Scale of the Cauchy loss.
+    tolerance : float
+        Root mean square of a step, in standard deviations of the unknowns, at which the adjustment ends.
+    """
+    pattern = ReducedPattern(problem)
+    found = linearize(problem, state, loss_scale_px)
+    initial_cost, damping, growth = found.cost, 0.0, 2.0
+    state, found = _with_refined_points(problem, state, found, loss_scale_px)
+    system = ReducedSystem.of(problem, pattern, found)
+    for count in range(MAX_NUM_STEPS):
+        report_progress(f"bundle adjustment, step {count + 1}")
+        try:
+            step = system.step(damping)
+        except SingularMatrixError:
+            damping = max(10.0 * damping, FIRST_DAMPING)
+            if damping > MAX_DAMPING:
+                break
+            continue
+        expected = -float(system.gradient @ step)
+        short = expected <= tolerance**2 * found.variance * problem.num_unknowns
+        step = found.relaxation * step
+        points = state.points + system.steps_of_points(problem, step, found.relaxation)
+        trial = state.moved(problem, step, points)
+        trial, there = _with_refined_points(problem, trial, linearize(problem, trial, loss_scale_px), loss_scale_px)
+        if there.cost < found.cost:
+            gain = 2.0 * (found.cost - there.cost) / expected
+            state, found, growth = trial, there, 2.0
+            damping = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            damping = damping if damping > FIRST_DAMPING else 0.0
+        else:
+            damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
+        if short or damping > MAX_DAMPING:
+            break
+        if found is there:
+            system = ReducedSystem.of(problem, pattern, found)
+    return Adjusted(state, initial_cost, found.cost)
+
+
+def _with_refined_points(
+    problem: BundleProblem, state: BundleState, found: Linearization, loss_scale_px: float
+) -> tuple[BundleState, Linearization]:
+    """Take a step of every point alone; points that lose by it stay."""
+    q, rows = len(state.points), problem.point_row
+    factors = factored(q, rows, found.by_point)
+    gradient = gradients(q, rows, found.by_point, found.residuals)
+    points = state.points - found.relaxation * factors.upper(factors.lower(gradient)).T
+    after = linearize(problem, BundleState(state.rotations, state.centers, points, state.parameters), loss_scale_px)
+    worse = after.costs > found.costs
+    if worse.any():
+        points = np.where(worse[:, None], state.points, points)
+        after = after.where(worse[rows], worse, found)
+    return BundleState(state.rotations, state.centers, points, state.parameters), after

@@ -1,0 +1,132 @@
+"""What bundle adjustment is given: observations, lenses and the images of points; and what it changes, the state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_vg.geometry import so3
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class Lens(Protocol):
+    """A camera model with some unknown parameters."""
+
+    @property
+    def free(self) -> IntArray:
+        """Indices (t,) of the parameters that are unknown."""
+
+    def project(self, parameters: Array, rays: Array) -> Array:
+        """Project rays (k, 3) of the camera's frame: pixels (k, 2), NaN where a ray has no projection."""
+
+
+@dataclass(frozen=True, eq=False)
+class BundleProblem:
+    """Observations of q points in n images, sorted by image.
+
+    Attributes
+    ----------
+    image_row, point_row : (k,) int64 array
+        Image and point of each observation; images ascend.
+    keypoints : (k, 2) array
+        Pixels.
+    camera_idx : (n,) int64 array
+        Lens of each image, ascending.
+    lenses : sequence of Lens
+    """
+
+    image_row: IntArray
+    point_row: IntArray
+    keypoints: Array
+    camera_idx: IntArray
+    lenses: Sequence[Lens]
+
+    @property
+    def num_images(self) -> int:
+        return len(self.camera_idx)
+
+    @cached_property
+    def starts(self) -> IntArray:
+        """First observation of each image, and the number of observations: (n + 1,)."""
+        return np.searchsorted(self.image_row, np.arange(self.num_images + 1))
+
+    @cached_property
+    def lens_starts(self) -> IntArray:
+        """First observation of each lens, and the number of observations: (c + 1,)."""
+        return np.searchsorted(self.camera_idx[self.image_row], np.arange(len(self.lenses) + 1))
+
+    @cached_property
+    def unknowns(self) -> IntArray:
+        """Unknowns of each image: six of its pose, then those of its lens, which images may share: (n, w); -1 is none.
+
+        Poses come first: unknown 6 i + c is component c of rotation and position of image i.
+        """
+        counts = np.array([len(lens.free) for lens in self.lenses], dtype=np.int64)
+        first = 6 * self.num_images + np.concatenate([[0], np.cumsum(counts)])
+        slots = np.arange(counts.max(initial=0))
+        of_lens = np.where(slots < counts[:, None], first[:-1, None] + slots, -1)
+        poses = np.arange(6 * self.num_images).reshape(-1, 6)
+        return np.concatenate([poses, of_lens[self.camera_idx]], axis=1)
+
+    @property
+    def num_unknowns(self) -> int:
+        return 6 * self.num_images + sum(len(lens.free) for lens in self.lenses)
+
+    @cached_property
+    def common(self) -> list[tuple[IntArray, IntArray, IntArray]]:
+        """Observations of one point by two images: for each image i ``(own, other, images)``.
+
+        Observation ``own[k]`` of image i and ``other[k]`` of a later image, ``images[k]``, which ascends.
+        """
+        by_point = np.argsort(self.point_row, kind="stable")
+        place = np.empty_like(by_point)
+        place[by_point] = np.arange(len(by_point))
+        last = np.searchsorted(self.point_row[by_point], self.point_row, side="right")
+        found = []
+        for start, end in zip(self.starts[:-1], self.starts[1:], strict=True):
+            own = np.arange(start, end)
+            following = last[own] - place[own] - 1
+            repeated = np.repeat(own, following)
+            rank = np.arange(len(repeated)) - np.repeat(np.cumsum(following) - following, following)
+            other = by_point[place[repeated] + 1 + rank]
+            order = np.argsort(other, kind="stable")
+            found.append((repeated[order], other[order], self.image_row[other[order]]))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class BundleState:
+    """Values of the unknowns.
+
+    Attributes
+    ----------
+    rotations : (n, 3, 3) array
+        cam_from_world.
+    centers : (n, 3) array
+        Projection centres, world frame.
+    points : (q, 3) array
+        World frame.
+    parameters : list of (p,) arrays
+        All parameters of each lens.
+    """
+
+    rotations: Array
+    centers: Array
+    points: Array
+    parameters: list[Array] = field(default_factory=list)
+
+    def moved(self, problem: BundleProblem, step: Array, points: Array) -> "BundleState":
+        """Take a step (u,) of the unknowns, with new points (q, 3)."""
+        poses = step[: 6 * problem.num_images].reshape(-1, 6)
+        parameters, place = [], 6 * problem.num_images
+        for lens, before in zip(problem.lenses, self.parameters, strict=True):
+            after, end = before.copy(), place + len(lens.free)
+            after[lens.free] += step[place:end]
+            parameters.append(after)
+            place = end
+        return BundleState(self.rotations @ so3.exp(poses[:, :3]), self.centers + poses[:, 3:], points, parameters)

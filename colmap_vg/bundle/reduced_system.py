@@ -1,0 +1,170 @@
+"""Normal equations of poses and lenses, from which all points are eliminated (Schur complement).
+
+With the Cholesky factor ``L`` of a point's own equations, an observation's derivatives ``F`` by its image's unknowns
+and ``A`` by its point, and ``Z = F^T A L^-T``, two images share the block ``-sum Z_i Z_j^T`` over their common points.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from colmap_vg.bundle.linearization import Linearization
+from colmap_vg.bundle.point_systems import PointFactors, factored, gradients
+from colmap_vg.bundle.problem import BundleProblem
+from colmap_vg.linear.assembly import BlockPattern, scattered
+from colmap_vg.linear.solvers import factorize
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MIN_DAMPING = 1e-9
+"""Share of the diagonal that is always added, since the gauge leaves seven degrees of freedom."""
+
+
+class ReducedPattern:
+    """Sparsity of the reduced system, analysed once.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+    """
+
+    def __init__(self, problem: BundleProblem) -> None:
+        pairs = [np.stack(np.unique(images, return_index=True)) for _, _, images in problem.common]
+        self.pairs = np.concatenate(
+            [np.stack([np.full(found.shape[1], i), found[0]], axis=1) for i, found in enumerate(pairs)]
+        )
+        """(m, 2): images with points in common."""
+        self.cuts = [np.append(found[1], len(own[0])) for found, own in zip(pairs, problem.common, strict=True)]
+        """For each image, where the pairs begin within `BundleProblem.common`."""
+        self.poses = BlockPattern(problem.num_images, self.pairs, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedSystem:
+    """Normal equations of the unknowns of poses and lenses.
+
+    Attributes
+    ----------
+    matrix : (u, u) csc_array
+    gradient : (u,) array
+    derivatives : (2, w, k) array
+        Of the residuals by the unknowns of their images.
+    across : (2, 3, k) array
+        Derivatives by points times ``L^-T``.
+    factors : PointFactors
+    of_points : (3, q) array
+        Gradients of points times ``L^-1``.
+    """
+
+    matrix: sp.csc_array
+    gradient: Array
+    derivatives: Array
+    across: Array
+    factors: PointFactors
+    of_points: Array
+
+    @classmethod
+    def of(cls, problem: BundleProblem, pattern: ReducedPattern, found: Linearization) -> "ReducedSystem":
+        """Assemble the system at a linearization."""
+        q, rows = len(found.costs), problem.point_row
+        factors = factored(q, rows, found.by_point)
+        of_points = factors.lower(gradients(q, rows, found.by_point, found.residuals))
+        own_factors = factors.at(rows)
+        across = np.stack([own_factors.lower(found.by_point[0]), own_factors.lower(found.by_point[1])])
+        derivatives = _by_unknowns(found)
+        own, pairs, gradient = _blocks(problem, pattern, found.residuals, derivatives, across, of_points)
+        matrix = _assembled(problem, pattern, own, pairs)
+        places, used = problem.unknowns.ravel(), problem.unknowns.ravel() >= 0
+        total = np.bincount(places[used], gradient.ravel()[used], minlength=problem.num_unknowns)
+        return cls(matrix, np.asarray(total, dtype=np.float64), derivatives, across, factors, of_points)
+
+    def step(self, damping: float) -> Array:
+        """Levenberg step (u,), with damping relative to the diagonal.
+
+        Raises
+        ------
+        SingularMatrixError
+            The observations do not determine all unknowns.
+        """
+        diagonal = self.matrix.diagonal()
+        least = np.finfo(np.float64).tiny + 1e-15 * diagonal.max()
+        level = np.maximum((damping + MIN_DAMPING) * diagonal, least)
+        return -factorize(sp.csc_array(self.matrix + sp.diags_array(level))).solve(self.gradient)
+
+    def steps_of_points(self, problem: BundleProblem, step: Array, relaxation: float) -> Array:
+        """Steps (q, 3) of the points that go with a step of the unknowns: its effect, and their own times a factor."""
+        padded = np.append(step, 0.0)[problem.unknowns].T
+        changes = np.einsum("awk,wk->ak", self.derivatives, np.take(padded, problem.image_row, axis=1))
+        induced = gradients(self.of_points.shape[1], problem.point_row, self.across, changes)
+        return -self.factors.upper(induced + relaxation * self.of_points).T
+
+
+def _by_unknowns(found: Linearization) -> Array:
+    """Derivatives (2, w, k) by rotation, position and lens of each observation's image."""
+    A, d = found.by_point, found.rays
+    derivatives = np.empty((2, 6 + found.by_lens.shape[1], d.shape[1]))
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        derivatives[:, axis] = A[:, last] * d[after] - A[:, after] * d[last]
+    np.negative(A, out=derivatives[:, 3:6])
+    derivatives[:, 6:] = found.by_lens
+    return derivatives
+
+
+def _blocks(
+    problem: BundleProblem,
+    pattern: ReducedPattern,
+    residuals: Array,
+    derivatives: Array,
+    across: Array,
+    of_points: Array,
+) -> tuple[Array, Array, Array]:
+    """Blocks of images (n, w, w) and of pairs (m, w, w), and gradients (n, w)."""
+    _, width, count = derivatives.shape
+    eliminated = np.empty((count, 3, width))
+    for axis in range(3):
+        for unknown in range(width):
+            eliminated[:, axis, unknown] = np.einsum("ak,ak->k", derivatives[:, unknown], across[:, axis])
+    by_row = np.ascontiguousarray(derivatives.transpose(2, 0, 1))
+    residual_rows = np.ascontiguousarray(residuals.T)
+    point_rows = np.ascontiguousarray(np.take(of_points, problem.point_row, axis=1).T)
+    own, gradient = np.empty((problem.num_images, width, width)), np.empty((problem.num_images, width))
+    for image, (start, end) in enumerate(zip(problem.starts[:-1], problem.starts[1:], strict=True)):
+        F, Z = by_row[start:end].reshape(-1, width), eliminated[start:end].reshape(-1, width)
+        own[image] = F.T @ F - Z.T @ Z
+        gradient[image] = F.T @ residual_rows[start:end].ravel() - Z.T @ point_rows[start:end].ravel()
+    pairs, place = np.empty((len(pattern.pairs), width, width)), 0
+    for (first, second, _), cuts in zip(problem.common, pattern.cuts, strict=True):
+        left, right = np.take(eliminated, first, axis=0), np.take(eliminated, second, axis=0)
+        for start, end in pairwise(cuts):
+            pairs[place] = -left[start:end].reshape(-1, width).T @ right[start:end].reshape(-1, width)
+            place += 1
+    return own, pairs, gradient
+
+
+def _assembled(problem: BundleProblem, pattern: ReducedPattern, own: Array, pairs: Array) -> sp.csc_array:
+    n, u = problem.num_images, problem.num_unknowns
+    nothing = np.zeros((len(pairs), 6, 6))
+    poses = pattern.poses.assemble(nothing, nothing, pairs[:, :6, :6], own[:, :6, :6])
+    if u == 6 * n:
+        return poses
+    i, j = pattern.pairs.T
+    rows, lenses = problem.unknowns[:, :6], np.maximum(problem.unknowns[:, 6:] - 6 * n, -1)
+    shape = (6 * n, u - 6 * n)
+    cross = scattered(
+        np.concatenate([own[:, :6, 6:], pairs[:, :6, 6:], np.swapaxes(pairs[:, 6:, :6], 1, 2)]),
+        np.concatenate([rows, rows[i], rows[j]]),
+        np.concatenate([lenses, lenses[j], lenses[i]]),
+        shape,
+    )
+    between = scattered(
+        np.concatenate([own[:, 6:, 6:], pairs[:, 6:, 6:], np.swapaxes(pairs[:, 6:, 6:], 1, 2)]),
+        np.concatenate([lenses, lenses[i], lenses[j]]),
+        np.concatenate([lenses, lenses[j], lenses[i]]),
+        (shape[1], shape[1]),
+    )
+    return sp.csc_array(sp.block_array([[poses, cross], [cross.T, between]]))
