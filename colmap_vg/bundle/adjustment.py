@@ -49,7 +49,7 @@ def adjust(
 ) -> Adjusted:
     """Adjust poses, lenses and points.
 
-    The gauge is free: it stays near the initial state's.
+    The gauge is free unless poses are held: it stays near the initial state's.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def adjust(
                 break
             continue
         expected = -float(system.gradient @ step)
-        short = expected <= tolerance**2 * found.variance * problem.num_unknowns
+        short = expected <= tolerance**2 * found.variance * len(problem.free)
         step = found.relaxation * step
         points = state.points + system.steps_of_points(problem, step, found.relaxation)
         trial = state.moved(problem, step, points)
@@ -100,9 +100,9 @@ def _with_refined_points(
     problem: BundleProblem, state: BundleState, found: Linearization, loss_scale_px: float
 ) -> tuple[BundleState, Linearization]:
     """Take a step of every point alone; points that lose by it stay."""
-    q, rows = len(state.points), problem.point_row
-    factors = factored(q, rows, found.by_point)
-    gradient = gradients(q, rows, found.by_point, found.residuals)
+    q, rows, by_point = len(state.points), problem.point_row, found.by_moving_point(problem)
+    factors = factored(q, rows, by_point)
+    gradient = gradients(q, rows, by_point, found.residuals)
     points = state.points - found.relaxation * factors.upper(factors.lower(gradient)).T
     after = linearize(problem, BundleState(state.rotations, state.centers, points, state.parameters), loss_scale_px)
     worse = after.costs > found.costs

@@ -58,7 +58,14 @@ class Linearization:
 
     @property
     def cost(self) -> float:
+        """Cost of all points, pixels squared."""
         return float(self.costs.sum())
+
+    def by_moving_point(self, problem: BundleProblem) -> Array:
+        """Derivatives by points, zero for fixed ones: (2, 3, k)."""
+        if problem.fixed is None:
+            return self.by_point
+        return np.where(problem.fixed[problem.point_row], 0.0, self.by_point)
 
     def where(self, observations: BoolArray, points: BoolArray, other: "Linearization") -> "Linearization":
         """Take some observations (k,) and points (q,) from another linearization with the same poses and lenses."""

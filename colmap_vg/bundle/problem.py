@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_vg.geometry import so3
 
 Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 
@@ -38,6 +39,10 @@ class BundleProblem:
     camera_idx : (n,) int64 array
         Lens of each image, ascending.
     lenses : sequence of Lens
+    held : (n,) bool array, optional
+        Images whose poses stay; none by default.
+    fixed : (q,) bool array, optional
+        Points that stay; none by default.
     """
 
     image_row: IntArray
@@ -45,6 +50,8 @@ class BundleProblem:
     keypoints: Array
     camera_idx: IntArray
     lenses: Sequence[Lens]
+    held: BoolArray | None = None
+    fixed: BoolArray | None = None
 
     @property
     def num_images(self) -> int:
@@ -73,8 +80,17 @@ class BundleProblem:
         poses = np.arange(6 * self.num_images).reshape(-1, 6)
         return np.concatenate([poses, of_lens[self.camera_idx]], axis=1)
 
+    @cached_property
+    def free(self) -> IntArray:
+        """The unknowns that are not of held poses: (f,)."""
+        free = np.ones(self.num_unknowns, dtype=bool)
+        if self.held is not None:
+            free[: 6 * self.num_images] = np.repeat(~self.held, 6)
+        return np.flatnonzero(free)
+
     @property
     def num_unknowns(self) -> int:
+        """Number of unknowns, those of held poses included."""
         return 6 * self.num_images + sum(len(lens.free) for lens in self.lenses)
 
     @cached_property

@@ -49,6 +49,8 @@ class ReducedSystem:
 
     Attributes
     ----------
+    free : (f,) int64 array
+        Unknowns that are not of held poses.
     matrix : (u, u) csc_array
     gradient : (u,) array
     derivatives : (2, w, k) array
@@ -60,6 +62,7 @@ class ReducedSystem:
         Gradients of points times ``L^-1``.
     """
 
+    free: IntArray
     matrix: sp.csc_array
     gradient: Array
     derivatives: Array
@@ -70,30 +73,34 @@ class ReducedSystem:
     @classmethod
     def of(cls, problem: BundleProblem, pattern: ReducedPattern, found: Linearization) -> "ReducedSystem":
         """Assemble the system at a linearization."""
-        q, rows = len(found.costs), problem.point_row
-        factors = factored(q, rows, found.by_point)
-        of_points = factors.lower(gradients(q, rows, found.by_point, found.residuals))
+        q, rows, by_point = len(found.costs), problem.point_row, found.by_moving_point(problem)
+        factors = factored(q, rows, by_point)
+        of_points = factors.lower(gradients(q, rows, by_point, found.residuals))
         own_factors = factors.at(rows)
-        across = np.stack([own_factors.lower(found.by_point[0]), own_factors.lower(found.by_point[1])])
+        across = np.stack([own_factors.lower(by_point[0]), own_factors.lower(by_point[1])])
         derivatives = _by_unknowns(found)
         own, pairs, gradient = _blocks(problem, pattern, found.residuals, derivatives, across, of_points)
         matrix = _assembled(problem, pattern, own, pairs)
         places, used = problem.unknowns.ravel(), problem.unknowns.ravel() >= 0
         total = np.bincount(places[used], gradient.ravel()[used], minlength=problem.num_unknowns)
-        return cls(matrix, np.asarray(total, dtype=np.float64), derivatives, across, factors, of_points)
+        return cls(problem.free, matrix, np.asarray(total, dtype=np.float64), derivatives, across, factors, of_points)
 
     def step(self, damping: float) -> Array:
-        """Levenberg step (u,), with damping relative to the diagonal.
+        """Levenberg step (u,), with damping relative to the diagonal; 0 for held poses.
 
         Raises
         ------
         SingularMatrixError
             The observations do not determine all unknowns.
         """
-        diagonal = self.matrix.diagonal()
-        least = np.finfo(np.float64).tiny + 1e-15 * diagonal.max()
+        matrix, step = self.matrix, np.zeros(len(self.gradient))
+        if len(self.free) < len(step):
+            matrix = matrix[self.free][:, self.free]
+        diagonal = matrix.diagonal()
+        least = np.finfo(np.float64).tiny + 1e-15 * diagonal.max(initial=0.0)
         level = np.maximum((damping + MIN_DAMPING) * diagonal, least)
-        return -factorize(sp.csc_array(self.matrix + sp.diags_array(level))).solve(self.gradient)
+        step[self.free] = -factorize(sp.csc_array(matrix + sp.diags_array(level))).solve(self.gradient[self.free])
+        return step
 
     def steps_of_points(self, problem: BundleProblem, step: Array, relaxation: float) -> Array:
         """Steps (q, 3) of the points that go with a step of the unknowns: its effect, and their own times a factor."""

@@ -5,7 +5,6 @@ Only tracks of three views or more adjust the cameras, since tracks of two views
 Points of two views are refined afterwards with the cameras fixed.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +14,7 @@ import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
 from colmap_vg.bundle.adjustment import TOLERANCE, TRIAL_TOLERANCE, adjust
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, focal_length
+from colmap_vg.colmap_io.model_observations import ModelObservations
 from colmap_vg.mapping.bundle_problem import ModelProblem, has_rigs
 from colmap_vg.mapping.observations import Observations, keypoint_sigma, loss_scale
 from colmap_vg.mapping.options import MIN_TRACK_LENGTH, bundle_options
@@ -77,10 +77,15 @@ def adjust_bundle(
     float
         Ratio of the final to the initial cost; 1 without observations.
     """
-    scale = loss_scale(reconstruction, MIN_TRACK_LENGTH)
-    if not (priors or held.sensors or held.frames) and not has_rigs(reconstruction):
-        ratio = _adjust_freely(reconstruction, options, scale, trial=trial)
-        _move_remaining_points(reconstruction, scale, held)
+    observed = ModelObservations.of(reconstruction)
+    scale = loss_scale(reconstruction, MIN_TRACK_LENGTH, observed)
+    if not priors and not has_rigs(reconstruction):
+        ratio = 1.0
+        if model := ModelProblem.of(reconstruction, observed, options, MIN_TRACK_LENGTH, held.frames):
+            found = adjust(model.problem, model.state, scale, tolerance=TRIAL_TOLERANCE if trial else TOLERANCE)
+            model.write(found.state, reconstruction)
+            ratio = found.final_cost / found.initial_cost if found.initial_cost > 0.0 else 1.0
+        _move_remaining_points(reconstruction, observed, scale, held)
         return ratio
     bundle = bundle_options(options, loss_scale_px=scale, trial=trial)
     config = pycolmap.BundleAdjustmentConfig()
@@ -108,34 +113,10 @@ def adjust_bundle(
         before.restore(reconstruction)
         kept = replace(options, ba_refine_extra_params=False)
         return adjust_bundle(reconstruction, kept, trial=trial, priors=priors, held=held)
-    _move_remaining_points(reconstruction, scale, held)
+    _move_remaining_points(reconstruction, observed, scale, held, only_short=not held.frames)
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)
     return float(costs.final_cost / costs.initial_cost) if costs is not None and costs.initial_cost > 0 else 1.0
-
-
-def _adjust_freely(
-    reconstruction: "pycolmap.Reconstruction", options: MappingOptions, scale_px: float, *, trial: bool
-) -> float:
-    """Adjust a model of single images that nothing holds; return the ratio of the final to the initial cost."""
-    model = ModelProblem.of(reconstruction, options, MIN_TRACK_LENGTH)
-    if model is None:
-        return 1.0
-    found = adjust(model.problem, model.state, scale_px, tolerance=TRIAL_TOLERANCE if trial else TOLERANCE)
-    model.write(found.state, reconstruction)
-    return found.final_cost / found.initial_cost if found.initial_cost > 0.0 else 1.0
-
-
-def _seen_by_others(reconstruction: "pycolmap.Reconstruction", held: Held) -> set[int]:
-    """Ids of points that frames which are not held see in half of their observations or more."""
-    seen: Counter[int] = Counter()
-    for image_id in reconstruction.reg_image_ids():
-        image = reconstruction.image(image_id)
-        if image.frame_id not in held.frames:
-            seen.update(point.point3D_id for point in image.get_observation_points2D())
-    return {
-        point_id for point_id, count in seen.items() if 2 * count >= reconstruction.point3D(point_id).track.length()
-    }
 
 
 def is_metric(reconstruction: "pycolmap.Reconstruction", sensors: Sequence["pycolmap.sensor_t"]) -> bool:
@@ -160,20 +141,29 @@ def _weighted(
     return copies
 
 
-def _move_remaining_points(reconstruction: "pycolmap.Reconstruction", scale_px: float, held: Held) -> None:
+def _move_remaining_points(
+    reconstruction: "pycolmap.Reconstruction",
+    observed: ModelObservations,
+    scale_px: float,
+    held: Held,
+    *,
+    only_short: bool = True,
+) -> None:
     """Refine points that did not move with the cameras, with these fixed.
 
-    Their tracks were too short, or cameras that are held see them, too; not those that are seen by these mostly.
+    Their tracks were too short, or Ceres left them since cameras that are held see them, too; not those that these see
+    mostly.
     """
-    points = sorted(reconstruction.points3D.items())
+    every, row, length = np.unique(observed.point_ids, return_inverse=True, return_counts=True)
+    moving = length < (MIN_TRACK_LENGTH if only_short else np.inf)
     if held.frames:
-        moving = _seen_by_others(reconstruction, held)
-        short = [(point_id, point) for point_id, point in points if point_id in moving]
-    else:
-        short = [(point_id, point) for point_id, point in points if point.track.length() < MIN_TRACK_LENGTH]
-    if not short:
+        frames = {i: reconstruction.image(i).frame_id in held.frames for i in np.unique(observed.image_ids).tolist()}
+        by_held = np.bincount(row, [frames[i] for i in observed.image_ids.tolist()], len(every))
+        moving &= 2.0 * by_held <= length
+    point_ids = every[moving]
+    if not len(point_ids):
         return
-    seen = Observations.of(reconstruction, [p for _, p in short])
+    seen = Observations.of(reconstruction, observed, point_ids)
     rays, focal = np.zeros((len(seen.keypoints), 3)), np.zeros(len(seen.keypoints))
     camera_ids = seen.camera_ids
     for camera_id in np.unique(camera_ids).tolist():
@@ -189,5 +179,5 @@ def _move_remaining_points(reconstruction: "pycolmap.Reconstruction", scale_px: 
         focal,
         scale_px=scale_px,
     )
-    for (_, point), position in zip(short, moved, strict=True):
-        point.xyz = position
+    for point_id, position in zip(point_ids.tolist(), moved, strict=True):
+        reconstruction.point3D(point_id).xyz = position

@@ -7,6 +7,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.bundle.problem import BundleProblem, BundleState
+from colmap_vg.colmap_io.model_observations import ModelObservations
 from colmap_vg.options import MappingOptions
 
 Array = NDArray[np.float64]
@@ -22,14 +23,16 @@ class ColmapLens:
         It is copied.
     options : MappingOptions
         Which parameters are refined.
+    held : bool
+        Whether none is.
     """
 
-    def __init__(self, camera: "pycolmap.Camera", options: MappingOptions) -> None:
+    def __init__(self, camera: "pycolmap.Camera", options: MappingOptions, *, held: bool = False) -> None:
         self._camera = pycolmap.Camera(camera.todict())
         free = list(camera.focal_length_idxs()) if options.ba_refine_focal_length else []
         free += list(camera.principal_point_idxs()) if options.ba_refine_principal_point else []
         free += list(camera.extra_params_idxs()) if options.ba_refine_extra_params else []
-        self.free: IntArray = np.array(free, dtype=np.int64)
+        self.free: IntArray = np.array([] if held else free, dtype=np.int64)
 
     def project(self, parameters: Array, rays: Array) -> Array:
         """Project rays (k, 3) of the camera's frame: pixels (k, 2), NaN where a ray has no projection."""
@@ -58,43 +61,53 @@ class ModelProblem:
 
     @classmethod
     def of(
-        cls, reconstruction: "pycolmap.Reconstruction", options: MappingOptions, min_track_length: int
+        cls,
+        reconstruction: "pycolmap.Reconstruction",
+        seen: ModelObservations,
+        options: MappingOptions,
+        min_track_length: int,
+        held_frames: frozenset[int] = frozenset(),
     ) -> "ModelProblem | None":
-        """Collect the points with tracks of some length; None without any."""
-        points = {
-            point_id: point
-            for point_id, point in sorted(reconstruction.points3D.items())
-            if point.track.length() >= min_track_length
-        }
-        if not points:
-            return None
+        """Collect the points with tracks of some length; None without any.
+
+        Frames that are held keep their poses and lenses, and the points that they see in more than half of their
+        observations.
+        """
         images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
         images.sort(key=lambda image: (image.camera_id, image.image_id))
-        row_of = {point_id: row for row, point_id in enumerate(points)}
-        image_row, point_row, keypoints = [], [], []
-        for row, image in enumerate(images):
-            for keypoint in image.get_observation_points2D():
-                point = row_of.get(keypoint.point3D_id)
-                if point is not None:
-                    image_row.append(row)
-                    point_row.append(point)
-                    keypoints.append(keypoint.xy)
+        held = np.array([image.frame_id in held_frames for image in images], dtype=bool)
+        image_row = _rows_of([image.image_id for image in images], seen.image_ids)
+        every, point_row, length = np.unique(seen.point_ids, return_inverse=True, return_counts=True)
+        views = np.bincount(point_row, ~held[image_row], len(every))
+        fixed = 2.0 * views < length
+        kept = (length >= min_track_length) & (views > 0.0)
+        if not kept.any():
+            return None
+        used = np.flatnonzero(kept[point_row] & ~(held[image_row] & fixed[point_row]))
+        used = used[np.argsort(image_row[used], kind="stable")]
+        point_ids = every[kept].tolist()
         camera_ids = sorted({image.camera_id for image in images})
         cameras = [reconstruction.camera(camera_id) for camera_id in camera_ids]
+        of_held = {image.camera_id for image, stays in zip(images, held, strict=True) if stays}
         problem = BundleProblem(
-            image_row=np.array(image_row, dtype=np.int64),
-            point_row=np.array(point_row, dtype=np.int64),
-            keypoints=np.array(keypoints),
+            image_row=image_row[used],
+            point_row=(np.cumsum(kept) - 1)[point_row[used]],
+            keypoints=seen.keypoints[used],
             camera_idx=np.searchsorted(camera_ids, [image.camera_id for image in images]),
-            lenses=[ColmapLens(camera, options) for camera in cameras],
+            lenses=[
+                ColmapLens(camera, options, held=camera_id in of_held)
+                for camera_id, camera in zip(camera_ids, cameras, strict=True)
+            ],
+            held=held if held_frames else None,
+            fixed=fixed[kept] if held_frames else None,
         )
         state = BundleState(
             rotations=np.array([image.cam_from_world().rotation.matrix() for image in images]),
             centers=np.array([image.projection_center() for image in images]),
-            points=np.array([point.xyz for point in points.values()]),
+            points=np.array([reconstruction.point3D(point_id).xyz for point_id in point_ids]),
             parameters=[np.array(camera.params, dtype=np.float64) for camera in cameras],
         )
-        return cls(problem, state, [image.image_id for image in images], camera_ids, list(points))
+        return cls(problem, state, [image.image_id for image in images], camera_ids, point_ids)
 
     def write(self, state: BundleState, reconstruction: "pycolmap.Reconstruction") -> None:
         """Give the reconstruction the poses, lenses and points of a state."""
@@ -105,6 +118,12 @@ class ModelProblem:
             reconstruction.frame(reconstruction.image(image_id).frame_id).rig_from_world = pose
         for point_id, position in zip(self.point_ids, state.points, strict=True):
             reconstruction.point3D(point_id).xyz = position
+
+
+def _rows_of(ids: list[int], wanted: IntArray) -> IntArray:
+    """Place of each wanted id among distinct ids."""
+    order = np.argsort(ids)
+    return np.asarray(order[np.searchsorted(np.array(ids)[order], wanted)])
 
 
 def has_rigs(reconstruction: "pycolmap.Reconstruction") -> bool:

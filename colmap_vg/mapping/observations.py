@@ -1,12 +1,12 @@
 """Observations of some of a model's points as arrays, and the scale of the robust loss that suits their residuals."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_vg.colmap_io.model_observations import ModelObservations
 from colmap_vg.linear.robust_losses import cauchy_weight
 
 Array = NDArray[np.float64]
@@ -45,15 +45,16 @@ class Observations:
     keypoints: Array
 
     @classmethod
-    def of(cls, reconstruction: "pycolmap.Reconstruction", points: Sequence["pycolmap.Point3D"]) -> "Observations":
-        """Collect the observations of some points, at least one."""
-        elements = [(row, e.image_id, e.point2D_idx) for row, p in enumerate(points) for e in p.track.elements]
-        point_row, image_of, _ = np.array(elements, dtype=np.int64).T
-        image_ids, image_row = np.unique(image_of, return_inverse=True)
-        images = {image_id: reconstruction.image(image_id) for image_id in image_ids.tolist()}
-        keypoints = np.array([images[i].point2D(k).xy for _, i, k in elements])
-        positions = np.array([p.xyz for p in points])
-        return cls(positions, point_row, image_row.reshape(-1), list(images.values()), keypoints)
+    def of(
+        cls, reconstruction: "pycolmap.Reconstruction", seen: ModelObservations, point_ids: IntArray
+    ) -> "Observations":
+        """Take the observations of some points, at least one, whose ids ascend."""
+        place = np.searchsorted(point_ids, seen.point_ids)
+        own = np.flatnonzero(point_ids[np.minimum(place, len(point_ids) - 1)] == seen.point_ids)
+        image_ids, image_row = np.unique(seen.image_ids[own], return_inverse=True)
+        images = [reconstruction.image(image_id) for image_id in image_ids.tolist()]
+        positions = np.array([reconstruction.point3D(point_id).xyz for point_id in point_ids.tolist()])
+        return cls(positions, place[own], image_row.reshape(-1), images, seen.keypoints[own])
 
     @property
     def rotations(self) -> Array:
@@ -82,7 +83,9 @@ class Observations:
         return errors
 
 
-def loss_scale(reconstruction: "pycolmap.Reconstruction", min_track_length: int) -> float:
+def loss_scale(
+    reconstruction: "pycolmap.Reconstruction", min_track_length: int, seen: ModelObservations | None = None
+) -> float:
     """Scale of a Cauchy loss for the residuals of a model, pixels; that of `MIN_SIGMA_PX` without points.
 
     Of candidates in standard deviations the one under which the estimated parameters have the least variance,
@@ -94,8 +97,10 @@ def loss_scale(reconstruction: "pycolmap.Reconstruction", min_track_length: int)
     reconstruction : pycolmap.Reconstruction
     min_track_length : int
         Shorter tracks do not count.
+    seen : ModelObservations, optional
+        Of the reconstruction, where they are known.
     """
-    squared = _squared_errors(reconstruction, min_track_length)
+    squared = _squared_errors(reconstruction, min_track_length, seen)
     if not len(squared):
         return float(SCALES_IN_SIGMAS[0] * MIN_SIGMA_PX)
     sigma = _sigma(squared)
@@ -104,29 +109,31 @@ def loss_scale(reconstruction: "pycolmap.Reconstruction", min_track_length: int)
 
 def keypoint_sigma(reconstruction: "pycolmap.Reconstruction", min_track_length: int) -> float:
     """Standard deviation of keypoints, pixels, by the median residual of a model's tracks of some length."""
-    squared = _squared_errors(reconstruction, min_track_length)
+    squared = _squared_errors(reconstruction, min_track_length, None)
     return _sigma(squared) if len(squared) else MIN_SIGMA_PX
 
 
 def num_projected(reconstruction: "pycolmap.Reconstruction") -> int:
     """Number of observations of a sample of points that have a projection, whatever their error."""
-    return len(_squared_errors(reconstruction, 2))
+    return len(_squared_errors(reconstruction, 2, None))
 
 
 def _sigma(squared: Array) -> float:
     return max(float(np.sqrt(np.median(squared))) / _MEDIAN_NORM, MIN_SIGMA_PX)
 
 
-def _squared_errors(reconstruction: "pycolmap.Reconstruction", min_track_length: int) -> Array:
+def _squared_errors(
+    reconstruction: "pycolmap.Reconstruction", min_track_length: int, seen: ModelObservations | None
+) -> Array:
     """Squared residuals (k,) of a sample of points, as they would be of known points."""
-    points = [point for _, point in sorted(reconstruction.points3D.items())]
-    lengths = np.array([point.track.length() for point in points], dtype=np.int64)
+    seen = seen or ModelObservations.of(reconstruction)
+    point_ids, lengths = np.unique(seen.point_ids, return_counts=True)
     long = np.flatnonzero(lengths >= min_track_length)
     if not len(long):
         return np.zeros(0)
     share = min(1.0, NUM_SAMPLED_OBSERVATIONS / int(lengths[long].sum()))
     rows = np.linspace(0, len(long) - 1, max(round(share * len(long)), 1)).astype(np.int64)
-    sample = Observations.of(reconstruction, [points[row] for row in long[np.unique(rows)].tolist()])
+    sample = Observations.of(reconstruction, seen, point_ids[long[np.unique(rows)]])
     # A point takes up three of the 2 L coordinates of its track, which reduces their residuals.
     length = np.bincount(sample.point_row)[sample.point_row]
     errors = sample.reprojection_errors(reconstruction) / np.sqrt(np.maximum(1.0 - 1.5 / length, 0.25))

@@ -1,11 +1,12 @@
 """Visibility of a model's points: which images observe them, and into which images they project."""
 
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+
+from colmap_vg.colmap_io.model_observations import ModelObservations
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -71,10 +72,9 @@ def sampled_tracks(
 
 
 def observed_points(reconstruction: "pycolmap.Reconstruction", image_ids: list[int]) -> tuple[IntArray, IntArray]:
-    """Ids of the points that images observe, and the row of the image, of each observation: two (k,) arrays."""
-    observed = [reconstruction.image(image_id).get_observation_points2D() for image_id in image_ids]
-    point_ids = np.array([keypoint.point3D_id for keypoint in chain.from_iterable(observed)], dtype=np.int64)
-    return point_ids, np.repeat(np.arange(len(image_ids)), [len(each) for each in observed])
+    """Ids of the points that the registered images observe, and the row of the image, for each observation: (k,)."""
+    seen = ModelObservations.of(reconstruction)
+    return seen.point_ids, np.searchsorted(image_ids, seen.image_ids)
 
 
 def in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xyz: Array) -> BoolArray:

@@ -7,13 +7,16 @@ import pytest
 from colmap_vg.bundle.adjustment import TOLERANCE, TRIAL_TOLERANCE, Adjusted
 from colmap_vg.bundle.problem import BundleProblem, BundleState
 from colmap_vg.mapping import build, bundle
-from colmap_vg.mapping.bundle import Held, adjust_bundle
+from colmap_vg.mapping.bundle import Held, adjust_bundle, held_of
 from colmap_vg.mapping.options import bundle_options
 from colmap_vg.options import MappingOptions
 
 ONE_THREAD = MappingOptions(num_threads=1)
 FEW_VIEWS = pycolmap.SyntheticDatasetOptions(
     num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=5, num_points3D=60, num_points2D_without_point3D=0
+)
+RIG = pycolmap.SyntheticDatasetOptions(
+    num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=60, num_points2D_without_point3D=0
 )
 
 
@@ -44,7 +47,7 @@ def test_the_scale_of_the_residuals_and_the_trial_reach_the_adjustment(
 
 
 @pytest.mark.parametrize("trial", [False, True])
-def test_they_reach_ceres_where_frames_are_held(trial: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_they_reach_ceres_where_cameras_are_a_rig(trial: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, scales = [], []
 
     def made(*arguments: object, **named: object) -> pycolmap.BundleAdjustmentOptions:
@@ -59,8 +62,8 @@ def test_they_reach_ceres_where_frames_are_held(trial: bool, monkeypatch: pytest
     monkeypatch.setattr(bundle, "bundle_options", made)
     monkeypatch.setattr(bundle, "refine_points", refined)
     pycolmap.set_random_seed(0)
-    model = with_short_tracks(pycolmap.synthesize_dataset(FEW_VIEWS))
-    adjust_bundle(model, ONE_THREAD, trial=trial, held=Held(frames=frozenset([1])))
+    model = with_short_tracks(pycolmap.synthesize_dataset(RIG))
+    adjust_bundle(model, ONE_THREAD, trial=trial, held=held_of(model))
     assert asked == [{"loss_scale_px": 0.37, "trial": trial}]
     assert scales == [0.37]
 

@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 
 from colmap_vg.bundle.adjustment import adjust
+from colmap_vg.colmap_io.model_observations import ModelObservations
 from colmap_vg.geometry.similarity import align_positions
 from colmap_vg.mapping.bundle_problem import ColmapLens, ModelProblem, has_rigs
 from colmap_vg.mapping.options import bundle_options
@@ -33,6 +34,15 @@ def noisy_model() -> pycolmap.Reconstruction:
     return model
 
 
+def problem_of(
+    model: pycolmap.Reconstruction,
+    options: MappingOptions,
+    min_track_length: int = 3,
+    held: frozenset[int] = frozenset(),
+) -> ModelProblem | None:
+    return ModelProblem.of(model, ModelObservations.of(model), options, min_track_length, held)
+
+
 def by_ceres(model: pycolmap.Reconstruction, options: MappingOptions) -> tuple[float, float]:
     """Adjust a model by Ceres to its end; return the costs before and after."""
     asked = bundle_options(options, loss_scale_px=SCALE_PX)
@@ -57,7 +67,7 @@ def by_ceres(model: pycolmap.Reconstruction, options: MappingOptions) -> tuple[f
 def test_it_ends_at_the_minimum_that_ceres_finds(options: MappingOptions) -> None:
     model, reference = noisy_model(), noisy_model()
     initial, final = by_ceres(reference, options)
-    problem = ModelProblem.of(model, options, 3)
+    problem = problem_of(model, options, 3)
     assert problem is not None
     found = adjust(problem.problem, problem.state, SCALE_PX, tolerance=1e-3)
     assert found.initial_cost == pytest.approx(initial, rel=1e-9)
@@ -76,7 +86,7 @@ def test_it_ends_at_the_minimum_that_ceres_finds(options: MappingOptions) -> Non
 
 def test_the_state_of_a_model_is_written_back_as_it_was() -> None:
     model, before = noisy_model(), noisy_model()
-    problem = ModelProblem.of(model, OPTIONS, 3)
+    problem = problem_of(model, OPTIONS, 3)
     assert problem is not None
     problem.write(problem.state, model)
     for image_id, image in before.images.items():
@@ -97,7 +107,7 @@ def test_images_are_in_the_order_of_their_cameras_and_short_tracks_are_left_out(
         elements = [(e.image_id, e.point2D_idx) for e in model.point3D(point_id).track.elements]
         for image_id, place in elements[2:]:
             model.delete_observation(image_id, place)
-    problem = ModelProblem.of(model, OPTIONS, 3)
+    problem = problem_of(model, OPTIONS, 3)
     assert problem is not None
     cameras = [model.image(i).camera_id for i in problem.image_ids]
     assert cameras == sorted(cameras)
@@ -112,7 +122,8 @@ def test_images_are_in_the_order_of_their_cameras_and_short_tracks_are_left_out(
 
 
 def test_a_model_without_long_tracks_has_no_problem() -> None:
-    assert ModelProblem.of(noisy_model(), OPTIONS, 100) is None
+    assert problem_of(noisy_model(), OPTIONS, 100) is None
+    assert problem_of(pycolmap.Reconstruction(), OPTIONS, 3) is None
 
 
 @pytest.mark.parametrize(
@@ -144,3 +155,43 @@ def test_rigs_are_recognised() -> None:
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=20)
     assert has_rigs(pycolmap.synthesize_dataset(options))
+
+
+def test_held_frames_keep_their_poses_lenses_and_points() -> None:
+    model = noisy_model()
+    for point_id in sorted(model.points3D)[::2]:
+        elements = [(e.image_id, e.point2D_idx) for e in model.point3D(point_id).track.elements]
+        for image_id, place in elements:
+            if image_id > 7:
+                model.delete_observation(image_id, place)
+    held_images = sorted(model.reg_image_ids())[:5]
+    frames = frozenset(model.image(i).frame_id for i in held_images)
+    cameras = {model.image(i).camera_id for i in held_images}
+    before = pycolmap.Reconstruction(model)
+    problem = problem_of(model, OPTIONS, 3, frames)
+    assert problem is not None
+    found = adjust(problem.problem, problem.state, SCALE_PX)
+    assert found.final_cost < found.initial_cost
+    problem.write(found.state, model)
+    for image_id, image in before.images.items():
+        moved = model.image(image_id).projection_center() - image.projection_center()
+        assert (np.linalg.norm(moved) < 1e-12) == (image_id in held_images)
+    for camera_id, camera in before.cameras.items():
+        assert (list(model.camera(camera_id).params) == list(camera.params)) == (camera_id in cameras)
+    num_moved = 0
+    for point_id, point in before.points3D.items():
+        others = sum(e.image_id not in held_images for e in point.track.elements)
+        stays = bool(np.array_equal(model.point3D(point_id).xyz, point.xyz))
+        assert stays or 2 * others >= point.track.length()
+        num_moved += not stays
+    assert 100 < num_moved < 200
+
+
+def test_points_that_only_held_frames_see_are_left_out() -> None:
+    model = noisy_model()
+    frames = frozenset(model.image(i).frame_id for i in sorted(model.reg_image_ids())[:11])
+    last = max(model.reg_image_ids())
+    seen_by_last = {p.point3D_id for p in model.image(last).get_observation_points2D()}
+    problem = problem_of(model, OPTIONS, 3, frames)
+    assert problem is not None
+    assert set(problem.point_ids) == seen_by_last

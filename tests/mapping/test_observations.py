@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_vg.colmap_io.model_observations import ModelObservations
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.linear.robust_losses import cauchy_weight
 from colmap_vg.mapping import observations
@@ -32,20 +33,21 @@ def model(noise_px: float = 0.0, heavy: bool = False, num_views: int = 8) -> pyc
 
 def test_observations_are_those_of_the_points() -> None:
     found = model(noise_px=2.0)
-    points = [found.points3D[i] for i in sorted(found.points3D)[:5]]
-    seen = Observations.of(found, points)
+    ids = sorted(found.points3D)[3:20:4]
+    seen = Observations.of(found, ModelObservations.of(found), np.array(ids))
     errors = seen.reprojection_errors(found)
-    row = 0
-    for number, point in enumerate(points):
-        for element in point.track.elements:
-            image = found.image(element.image_id)
-            assert seen.point_row[row] == number
-            assert seen.images[seen.image_row[row]].image_id == element.image_id
-            assert seen.camera_ids[row] == image.camera_id
-            offset = image.project_point(point.xyz) - image.point2D(element.point2D_idx).xy
-            assert errors[row] == pytest.approx(np.linalg.norm(offset), rel=1e-9)
-            row += 1
-    assert row == len(errors)
+    told = {}
+    for row, (point, image) in enumerate(zip(seen.point_row.tolist(), seen.image_row.tolist(), strict=True)):
+        assert seen.camera_ids[row] == seen.images[image].camera_id
+        told[ids[point], seen.images[image].image_id, *seen.keypoints[row].tolist()] = errors[row]
+    expected = {}
+    for point_id in ids:
+        for element in found.points3D[point_id].track.elements:
+            image, keypoint = found.image(element.image_id), found.image(element.image_id).point2D(element.point2D_idx)
+            offset = image.project_point(found.points3D[point_id].xyz) - keypoint.xy
+            expected[point_id, element.image_id, *keypoint.xy.tolist()] = np.linalg.norm(offset)
+    assert told == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_array_equal(seen.positions, [found.points3D[i].xyz for i in ids])
 
 
 @pytest.mark.parametrize("noise_px", [0.3, 2.0])
@@ -72,7 +74,8 @@ def test_the_scale_is_that_of_the_noise_although_points_follow_it(num_views: int
         for image_id, image in exact.images.items()
         for row, point in enumerate(found.image(image_id).points2D)
     ]
-    seen = Observations.of(found, list(found.points3D.values()))
+    ids = sorted(found.points3D)
+    seen = Observations.of(found, ModelObservations.of(found), np.array(ids))
     camera = found.camera(1)
     rays = np.concatenate([camera.cam_from_img(seen.keypoints), np.ones((len(seen.keypoints), 1))], axis=1)
     moved = refine_points(
@@ -84,8 +87,8 @@ def test_the_scale_is_that_of_the_noise_although_points_follow_it(num_views: int
         scale_px=20.0,
         num_iterations=20,
     )
-    for point, position in zip(found.points3D.values(), moved, strict=True):
-        point.xyz = position
+    for point_id, position in zip(ids, moved, strict=True):
+        found.point3D(point_id).xyz = position
     squared = np.sum(np.square(noise), axis=1)
     expected = SCALES_IN_SIGMAS[np.argmin(variances(squared, SCALES_IN_SIGMAS))]
     assert loss_scale(found, 3) == pytest.approx(expected, rel=0.07)

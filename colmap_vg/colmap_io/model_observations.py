@@ -1,0 +1,59 @@
+"""The observations of a COLMAP model as arrays.
+
+Asking pycolmap for each keypoint takes 3 microseconds; COLMAP writes all of them into a file in a tenth of that time.
+"""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
+_POSE_AND_CAMERA = 4 + 7 * 8 + 4
+"""Bytes of an image's id, pose and camera in COLMAP's binary file, before its name."""
+_NO_POINT = np.iinfo(np.uint64).max
+
+
+@dataclass(frozen=True, eq=False)
+class ModelObservations:
+    """Observations of all points in the registered images of a model.
+
+    Attributes
+    ----------
+    image_ids, point_ids : (k,) int64 array
+        Image and point of each observation; images ascend.
+    keypoints : (k, 2) array
+        Pixels.
+    """
+
+    image_ids: IntArray
+    point_ids: IntArray
+    keypoints: Array
+
+    @classmethod
+    def of(cls, reconstruction: "pycolmap.Reconstruction") -> Self:
+        """Collect the observations of a reconstruction."""
+        with tempfile.TemporaryDirectory() as folder:
+            reconstruction.write_binary(folder)
+            content = (Path(folder) / "images.bin").read_bytes()
+        found, place = {}, 8
+        for _ in range(int.from_bytes(content[:8], "little")):
+            image_id = int.from_bytes(content[place : place + 4], "little")
+            place = content.index(b"\0", place + _POSE_AND_CAMERA) + 1
+            count = int.from_bytes(content[place : place + 8], "little")
+            keypoints = np.frombuffer(content, _KEYPOINT, count, place + 8)
+            found[image_id] = keypoints[keypoints["point_id"] != _NO_POINT]
+            place += 8 + count * _KEYPOINT.itemsize
+        rows = np.concatenate([found[image_id] for image_id in sorted(found)] or [np.empty(0, _KEYPOINT)])
+        return cls(
+            image_ids=np.repeat(sorted(found), [len(found[image_id]) for image_id in sorted(found)]).astype(np.int64),
+            point_ids=rows["point_id"].astype(np.int64),
+            keypoints=np.ascontiguousarray(rows["xy"]),
+        )

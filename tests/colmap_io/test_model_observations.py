@@ -1,0 +1,35 @@
+"""Observations of a model as arrays: those that pycolmap tells one by one."""
+
+import numpy as np
+import pycolmap
+
+from colmap_vg.colmap_io.model_observations import ModelObservations
+
+
+def test_they_are_those_of_the_registered_images() -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(
+            num_rigs=2, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=50, num_points2D_without_point3D=20
+        )
+    )
+    model.image(2).name = "a name with blanks/and a folder.jpg"
+    for point_id in sorted(model.points3D)[::3]:
+        model.delete_point3D(point_id)
+    model.deregister_frame(model.image(3).frame_id)
+    expected = [
+        (image_id, keypoint.point3D_id, *keypoint.xy.tolist())
+        for image_id in sorted(model.reg_image_ids())
+        for keypoint in model.image(image_id).get_observation_points2D()
+    ]
+    found = ModelObservations.of(model)
+    assert len(expected) > 100
+    told = zip(found.image_ids.tolist(), found.point_ids.tolist(), *found.keypoints.T.tolist(), strict=True)
+    assert list(told) == expected
+
+
+def test_a_model_without_images_has_none() -> None:
+    found = ModelObservations.of(pycolmap.Reconstruction())
+    assert found.keypoints.shape == (0, 2)
+    assert len(found.image_ids) == len(found.point_ids) == 0
+    assert found.image_ids.dtype == np.int64
