@@ -21,7 +21,7 @@ from colmap_vg.linear.solvers import SingularMatrixError
 
 Array = NDArray[np.float64]
 
-TOLERANCE = 0.1
+TOLERANCE = 0.15
 """Root mean square of a step, in standard deviations of the unknowns, at which the adjustment ends."""
 TRIAL_TOLERANCE = 0.5
 """The same where only the cost is asked for."""
