@@ -27,6 +27,9 @@ TRIAL_TOLERANCE = 0.5
 """The same where only the cost is asked for."""
 MAX_NUM_STEPS = 40
 """Maximum number of steps."""
+MAX_NUM_REFINEMENTS = 3
+"""Maximum number of steps of the points after one of the poses. One suffices after most; where a valley of the cost is
+narrow and bent, as that of a turntable's focal length, the points need more to follow a long step along it."""
 FIRST_DAMPING, MAX_DAMPING = 1e-8, 1e4
 """Damping after the first step that fails, and damping at which no step helps."""
 
@@ -81,7 +84,11 @@ def adjust(
         step = found.relaxation * step
         points = state.points + system.steps_of_points(problem, step, found.relaxation)
         trial = state.moved(problem, step, points)
-        trial, there = _with_refined_points(problem, trial, linearize(problem, trial, loss_scale_px), loss_scale_px)
+        there = linearize(problem, trial, loss_scale_px)
+        for _ in range(MAX_NUM_REFINEMENTS):
+            trial, there = _with_refined_points(problem, trial, there, loss_scale_px)
+            if there.cost < found.cost:
+                break
         if there.cost < found.cost:
             gain = 2.0 * (found.cost - there.cost) / expected
             state, found, growth = trial, there, 2.0

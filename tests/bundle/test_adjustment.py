@@ -311,3 +311,25 @@ def test_derivatives_by_a_parameter_near_zero_and_by_a_large_one() -> None:
     np.testing.assert_allclose(found.by_lens[:, 0].T, flat * (1.0 + k * squared), rtol=1e-6)
     np.testing.assert_allclose(found.by_lens[:, 1].T, f * flat * squared, rtol=1e-6, atol=1e-6)
     assert DIFFERENCE < 1e-5
+
+
+def test_points_follow_a_step_that_gains_only_once_they_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = scene(sigma_px=0.5)
+    start = displaced(problem, truth, 0.01)
+    refined = adjustment._with_refined_points
+    calls = []
+
+    def gaining_late(
+        asked: BundleProblem, state: BundleState, found: Linearization, scale_px: float
+    ) -> tuple[BundleState, Linearization]:
+        after, there = refined(asked, state, found, scale_px)
+        calls.append(there.cost)
+        late = len(calls) % adjustment.MAX_NUM_REFINEMENTS == 1 or len(calls) == 1
+        return after, there if late else replace(there, costs=there.costs + 1e6)
+
+    monkeypatch.setattr(adjustment, "_with_refined_points", gaining_late)
+    monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 1)
+    found = adjust(problem, start, 1.0)
+    # Once at the start, then three times after the step, of which only the last one gains.
+    assert len(calls) == 1 + adjustment.MAX_NUM_REFINEMENTS
+    assert found.final_cost == calls[-1] < found.initial_cost
