@@ -30,6 +30,8 @@ MAX_NUM_STEPS = 40
 MAX_NUM_REFINEMENTS = 3
 """Maximum number of steps of the points after one of the poses. One suffices after most; where a valley of the cost is
 narrow and bent, as that of a turntable's focal length, the points need more to follow a long step along it."""
+WITHIN_REACH = 1.2
+"""Cost after a step, over that before, above which points are not expected to make up for it."""
 FIRST_DAMPING, MAX_DAMPING = 1e-8, 1e4
 """Damping after the first step that fails, and damping at which no step helps."""
 
@@ -69,7 +71,7 @@ def adjust(
     found = linearize(problem, state, loss_scale_px)
     initial_cost, damping, growth = found.cost, 0.0, 2.0
     state, found = _with_refined_points(problem, state, found, loss_scale_px)
-    system = ReducedSystem.of(problem, pattern, found)
+    system = ReducedSystem.of(problem, pattern, state, found)
     for count in range(MAX_NUM_STEPS):
         report_progress(f"bundle adjustment, step {count + 1}")
         try:
@@ -87,7 +89,7 @@ def adjust(
         there = linearize(problem, trial, loss_scale_px)
         for _ in range(MAX_NUM_REFINEMENTS):
             trial, there = _with_refined_points(problem, trial, there, loss_scale_px)
-            if there.cost < found.cost:
+            if there.cost < found.cost or there.cost > WITHIN_REACH * found.cost:
                 break
         if there.cost < found.cost:
             gain = 2.0 * (found.cost - there.cost) / expected
@@ -99,7 +101,7 @@ def adjust(
         if short or damping > MAX_DAMPING:
             break
         if found is there:
-            system = ReducedSystem.of(problem, pattern, found)
+            system = ReducedSystem.of(problem, pattern, state, found)
     return Adjusted(state, initial_cost, found.cost)
 
 

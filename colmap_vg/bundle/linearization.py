@@ -21,6 +21,8 @@ BoolArray = NDArray[np.bool_]
 
 DIFFERENCE = 1e-6
 """Half the interval of central differences, of unit rays and relative to lens parameters above one."""
+MIN_AHEAD = 0.1
+"""Minimum cosine between all rays and the optical axis for derivatives along the axis to follow from the others."""
 LOST_PX = 1000.0
 """Residual of an observation without a projection, pixels: no step gains by losing points."""
 MAX_RELAXATION = 1.9
@@ -35,10 +37,10 @@ class Linearization:
     ----------
     rays : (3, k) array
         Point minus projection centre, world frame.
+    roots : (k,) array
+        Roots of the weights; 0 where a point has no projection.
     residuals : (2, k) array
     by_point : (2, 3, k) array
-    by_lens : (2, t, k) array
-        By the unknown parameters of the image's lens, padded with zeros.
     costs : (q,) array
         Cost of each point, pixels squared.
     relaxation : float
@@ -49,9 +51,9 @@ class Linearization:
     """
 
     rays: Array
+    roots: Array
     residuals: Array
     by_point: Array
-    by_lens: Array
     costs: Array
     relaxation: float
     variance: float
@@ -72,15 +74,15 @@ class Linearization:
         return replace(
             self,
             rays=np.where(observations, other.rays, self.rays),
+            roots=np.where(observations, other.roots, self.roots),
             residuals=np.where(observations, other.residuals, self.residuals),
             by_point=np.where(observations, other.by_point, self.by_point),
-            by_lens=np.where(observations, other.by_lens, self.by_lens),
             costs=np.where(points, other.costs, self.costs),
         )
 
 
 def linearize(problem: BundleProblem, state: BundleState, loss_scale_px: float) -> Linearization:
-    """Compute residuals, derivatives and costs.
+    """Compute residuals, derivatives by points, and costs.
 
     Parameters
     ----------
@@ -89,69 +91,75 @@ def linearize(problem: BundleProblem, state: BundleState, loss_scale_px: float) 
     loss_scale_px : float
         Scale c of the loss ``c^2 log(1 + |r|^2 / c^2) / 2``.
     """
-    count = len(problem.image_row)
-    rays, local = np.empty((3, count)), np.empty((3, count))
     positions = np.take(np.ascontiguousarray(state.points.T), problem.point_row, axis=1)
-    images = [slice(*ends) for ends in zip(problem.starts[:-1], problem.starts[1:], strict=True)]
-    for image, own in enumerate(images):
+    rays = np.empty_like(positions)
+    for image, own in enumerate(problem.of_images):
         rays[:, own] = positions[:, own] - state.centers[image][:, None]
-        local[:, own] = state.rotations[image] @ rays[:, own]
-    distance = np.maximum(np.sqrt(np.einsum("ak,ak->k", local, local)), np.finfo(np.float64).tiny)
-    width = problem.unknowns.shape[1] - 6
-    residuals, by_ray, by_lens = np.empty((2, count)), np.empty((2, 3, count)), np.zeros((2, width, count))
-    for idx, lens in enumerate(problem.lenses):
-        own = slice(*problem.lens_starts[idx : idx + 2])
-        units, parameters = np.ascontiguousarray((local[:, own] / distance[own]).T), state.parameters[idx]
-        residuals[:, own] = (lens.project(parameters, units) - problem.keypoints[own]).T
-        by_ray[:, :, own] = _derivative_by_ray(lens, parameters, units)
-        by_lens[:, : len(lens.free), own] = _derivative_by_parameters(lens, parameters, units)
+    units, distance = _in_cameras(problem, state, rays)
+    residuals, by_ray = np.empty((2, len(distance))), np.empty((2, 3, len(distance)))
+    for idx, (lens, parameters) in enumerate(zip(problem.lenses, state.parameters, strict=True)):
+        own = problem.of_lenses[idx]
+        residuals[:, own] = (lens.project(parameters, units[own]) - problem.keypoints[own]).T
+        by_ray[:, :, own] = _derivative_by_ray(lens, parameters, units[own])
     by_ray /= distance
     by_point = np.empty_like(by_ray)
-    for image, own in enumerate(images):
+    for image, own in enumerate(problem.of_images):
         by_point[:, :, own] = state.rotations[image].T @ by_ray[:, :, own]
     lost = ~(np.isfinite(residuals).all(axis=0) & np.isfinite(by_point).all(axis=(0, 1)))
-    lost |= ~np.isfinite(by_lens).all(axis=(0, 1))
     if lost.any():
         residuals[:, lost] = LOST_PX / np.sqrt(2.0)
-        by_point[:, :, lost], by_lens[:, :, lost] = 0.0, 0.0
-    return _weighted(problem, rays, residuals, by_point, by_lens, len(state.points), loss_scale_px)
-
-
-def _weighted(
-    problem: BundleProblem,
-    rays: Array,
-    residuals: Array,
-    by_point: Array,
-    by_lens: Array,
-    num_points: int,
-    loss_scale_px: float,
-) -> Linearization:
+        by_point[:, :, lost] = 0.0
     norm = np.einsum("ak,ak->k", residuals, residuals)
     squared = norm / loss_scale_px**2
     weight = cauchy_weight(squared)
-    costs = 0.5 * loss_scale_px**2 * np.bincount(problem.point_row, cauchy_loss(squared), minlength=num_points)
+    costs = np.bincount(problem.point_row, cauchy_loss(squared), minlength=len(state.points))
     # The loss's Hessian, averaged over the direction of a residual, is the square of its weight.
     mean, curvature = float(weight.mean()), float(np.square(weight).mean())
     spread = float((np.square(weight) * norm).mean()) / 2.0
-    root = np.sqrt(weight)
+    roots = np.where(lost, 0.0, np.sqrt(weight))
     return Linearization(
         rays,
-        root * residuals,
-        root * by_point,
-        root * by_lens,
-        np.asarray(costs),
+        roots,
+        roots * residuals,
+        roots * by_point,
+        np.asarray(0.5 * loss_scale_px**2 * costs),
         relaxation=float(np.clip(mean / curvature, 1.0, MAX_RELAXATION)),
         variance=max(spread * mean / curvature**2, np.finfo(np.float64).tiny),
     )
 
 
+def derivatives_by_lens(problem: BundleProblem, state: BundleState, found: Linearization) -> Array:
+    """Derivatives (2, t, k) of weighted residuals by the unknown parameters of each image's lens, padded with zeros."""
+    units, _ = _in_cameras(problem, state, found.rays)
+    derivatives = np.zeros((2, problem.unknowns.shape[1] - 6, len(units)))
+    for idx, (lens, parameters) in enumerate(zip(problem.lenses, state.parameters, strict=True)):
+        own = problem.of_lenses[idx]
+        derivatives[:, : len(lens.free), own] = _derivative_by_parameters(lens, parameters, units[own])
+    return np.asarray(found.roots * np.where(np.isfinite(derivatives), derivatives, 0.0))
+
+
+def _in_cameras(problem: BundleProblem, state: BundleState, rays: Array) -> tuple[Array, Array]:
+    """Unit rays (k, 3) in the frames of the cameras, and lengths (k,), of world rays (3, k)."""
+    local = np.empty_like(rays)
+    for image, own in enumerate(problem.of_images):
+        local[:, own] = state.rotations[image] @ rays[:, own]
+    distance = np.maximum(np.sqrt(np.einsum("ak,ak->k", local, local)), np.finfo(np.float64).tiny)
+    return np.ascontiguousarray((local / distance).T), distance
+
+
 def _derivative_by_ray(lens: Lens, parameters: Array, rays: Array) -> Array:
-    """Derivatives (2, 3, k) of the projection of unit rays (k, 3)."""
+    """Derivatives (2, 3, k) of the projection of unit rays (k, 3).
+
+    A projection does not change along its ray, so two axes tell the third unless that is nearly perpendicular to a ray.
+    """
     found = np.empty((2, 3, len(rays)))
-    for axis in range(3):
+    ahead = float(np.abs(rays[:, 2]).min(initial=1.0)) > MIN_AHEAD
+    for axis in range(2 if ahead else 3):
         offset = DIFFERENCE * np.eye(3)[axis]
         ends = lens.project(parameters, rays + offset) - lens.project(parameters, rays - offset)
         found[:, axis] = ends.T / (2.0 * DIFFERENCE)
+    if ahead:
+        found[:, 2] = -(found[:, 0] * rays[:, 0] + found[:, 1] * rays[:, 1]) / rays[:, 2]
     return found
 
 

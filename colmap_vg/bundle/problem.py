@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -63,9 +64,15 @@ class BundleProblem:
         return np.searchsorted(self.image_row, np.arange(self.num_images + 1))
 
     @cached_property
-    def lens_starts(self) -> IntArray:
-        """First observation of each lens, and the number of observations: (c + 1,)."""
-        return np.searchsorted(self.camera_idx[self.image_row], np.arange(len(self.lenses) + 1))
+    def of_images(self) -> list[slice]:
+        """Observations of each image."""
+        return [slice(start, end) for start, end in pairwise(self.starts.tolist())]
+
+    @cached_property
+    def of_lenses(self) -> list[slice]:
+        """Observations of each lens."""
+        starts = np.searchsorted(self.camera_idx[self.image_row], np.arange(len(self.lenses) + 1))
+        return [slice(start, end) for start, end in pairwise(starts.tolist())]
 
     @cached_property
     def unknowns(self) -> IntArray:

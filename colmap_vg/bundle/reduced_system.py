@@ -11,9 +11,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from colmap_vg.bundle.linearization import Linearization
+from colmap_vg.bundle.linearization import Linearization, derivatives_by_lens
 from colmap_vg.bundle.point_systems import PointFactors, factored, gradients
-from colmap_vg.bundle.problem import BundleProblem
+from colmap_vg.bundle.problem import BundleProblem, BundleState
 from colmap_vg.linear.assembly import BlockPattern, scattered
 from colmap_vg.linear.solvers import factorize
 
@@ -71,14 +71,16 @@ class ReducedSystem:
     of_points: Array
 
     @classmethod
-    def of(cls, problem: BundleProblem, pattern: ReducedPattern, found: Linearization) -> "ReducedSystem":
-        """Assemble the system at a linearization."""
+    def of(
+        cls, problem: BundleProblem, pattern: ReducedPattern, state: BundleState, found: Linearization
+    ) -> "ReducedSystem":
+        """Assemble the system at a state and its linearization."""
         q, rows, by_point = len(found.costs), problem.point_row, found.by_moving_point(problem)
         factors = factored(q, rows, by_point)
         of_points = factors.lower(gradients(q, rows, by_point, found.residuals))
         own_factors = factors.at(rows)
         across = np.stack([own_factors.lower(by_point[0]), own_factors.lower(by_point[1])])
-        derivatives = _by_unknowns(found)
+        derivatives = _by_unknowns(found, derivatives_by_lens(problem, state, found))
         own, pairs, gradient = _blocks(problem, pattern, found.residuals, derivatives, across, of_points)
         matrix = _assembled(problem, pattern, own, pairs)
         places, used = problem.unknowns.ravel(), problem.unknowns.ravel() >= 0
@@ -110,15 +112,15 @@ class ReducedSystem:
         return -self.factors.upper(induced + relaxation * self.of_points).T
 
 
-def _by_unknowns(found: Linearization) -> Array:
+def _by_unknowns(found: Linearization, by_lens: Array) -> Array:
     """Derivatives (2, w, k) by rotation, position and lens of each observation's image."""
     A, d = found.by_point, found.rays
-    derivatives = np.empty((2, 6 + found.by_lens.shape[1], d.shape[1]))
+    derivatives = np.empty((2, 6 + by_lens.shape[1], d.shape[1]))
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
         derivatives[:, axis] = A[:, last] * d[after] - A[:, after] * d[last]
     np.negative(A, out=derivatives[:, 3:6])
-    derivatives[:, 6:] = found.by_lens
+    derivatives[:, 6:] = by_lens
     return derivatives
 
 

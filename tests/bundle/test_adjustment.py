@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from colmap_vg.bundle import adjustment
 from colmap_vg.bundle.adjustment import adjust
-from colmap_vg.bundle.linearization import DIFFERENCE, LOST_PX, Linearization, linearize
+from colmap_vg.bundle.linearization import (
+    DIFFERENCE,
+    LOST_PX,
+    Linearization,
+    _derivative_by_ray,
+    derivatives_by_lens,
+    linearize,
+)
 from colmap_vg.bundle.point_systems import DAMPING, factored, gradients
 from colmap_vg.bundle.problem import BundleProblem, BundleState
 from colmap_vg.bundle.reduced_system import MIN_DAMPING, ReducedPattern, ReducedSystem
@@ -113,7 +120,7 @@ def test_a_step_is_that_of_the_whole_dense_problem(num_lenses: int, free: tuple[
     points = np.einsum("kii->ki", np.stack([H[i : i + 3, i : i + 3] for i in range(u, len(H), 3)]))
     diagonal[u:] = np.repeat(DAMPING * points.sum(axis=1), 3)
     found = linearize(problem, state, scale)
-    system = ReducedSystem.of(problem, ReducedPattern(problem), found)
+    system = ReducedSystem.of(problem, ReducedPattern(problem), state, found)
     full = H + np.diag(diagonal)
     reduced = full[:u, :u] - full[:u, u:] @ np.linalg.solve(full[u:, u:], full[u:, :u])
     gradient = J.T @ r
@@ -145,7 +152,7 @@ def test_two_observations_of_a_point_in_one_image_count_twice() -> None:
     J, _ = jacobian(twice, state, 2.0)
     H, u = J.T @ J, problem.num_unknowns
     reduced = H[:u, :u] - H[:u, u:] @ np.linalg.solve(H[u:, u:], H[u:, :u])
-    found = ReducedSystem.of(twice, ReducedPattern(twice), linearize(twice, state, 2.0)).matrix.toarray()
+    found = ReducedSystem.of(twice, ReducedPattern(twice), state, linearize(twice, state, 2.0)).matrix.toarray()
     size = np.sqrt(np.diag(reduced))
     np.testing.assert_allclose(found / np.outer(size, size), reduced / np.outer(size, size), atol=1e-4)
 
@@ -178,7 +185,8 @@ def test_points_without_a_projection_pull_nothing_and_cost_much() -> None:
     lost = np.flatnonzero((problem.point_row == 0) & (problem.image_row == 0))
     assert len(lost) == 1
     assert not found.by_point[:, :, lost].any()
-    assert not found.by_lens[:, :, lost].any()
+    assert not derivatives_by_lens(problem, replace(truth, points=points), found)[:, :, lost].any()
+    assert not found.residuals[:, lost].any()
     assert found.costs[0] >= 0.5 * np.log1p(LOST_PX**2)
     assert np.isfinite(found.by_point).all()
 
@@ -231,15 +239,12 @@ def test_the_end_is_within_the_tolerance_of_the_minimum() -> None:
     rough, exact = adjust(problem, start, 2.0, tolerance=0.1), adjust(problem, start, 2.0, tolerance=1e-4)
     assert exact.final_cost <= rough.final_cost
     found = linearize(problem, exact.state, 2.0)
-    system = ReducedSystem.of(problem, ReducedPattern(problem), found)
+    system = ReducedSystem.of(problem, ReducedPattern(problem), exact.state, found)
     # The cost above the minimum is half the squared distance in standard deviations.
     distance = np.sqrt(2.0 * (rough.final_cost - exact.final_cost) / found.variance / problem.num_unknowns)
     assert distance < 0.1
-    assert (
-        np.abs(system.gradient).max()
-        < 1e-2
-        * np.abs(ReducedSystem.of(problem, ReducedPattern(problem), linearize(problem, start, 2.0)).gradient).max()
-    )
+    initial = ReducedSystem.of(problem, ReducedPattern(problem), start, linearize(problem, start, 2.0)).gradient
+    assert np.abs(system.gradient).max() < 1e-2 * np.abs(initial).max()
 
 
 def test_costs_never_rise_even_from_far_away() -> None:
@@ -308,8 +313,9 @@ def test_derivatives_by_a_parameter_near_zero_and_by_a_large_one() -> None:
     flat = local[:, :2] / local[:, 2:]
     squared = np.sum(flat**2, axis=1, keepdims=True)
     f, _, _, k = truth.parameters[0]
-    np.testing.assert_allclose(found.by_lens[:, 0].T, flat * (1.0 + k * squared), rtol=1e-6)
-    np.testing.assert_allclose(found.by_lens[:, 1].T, f * flat * squared, rtol=1e-6, atol=1e-6)
+    by_lens = derivatives_by_lens(problem, truth, found)
+    np.testing.assert_allclose(by_lens[:, 0].T, flat * (1.0 + k * squared), rtol=1e-6)
+    np.testing.assert_allclose(by_lens[:, 1].T, f * flat * squared, rtol=1e-6, atol=1e-6)
     assert DIFFERENCE < 1e-5
 
 
@@ -325,7 +331,7 @@ def test_points_follow_a_step_that_gains_only_once_they_have(monkeypatch: pytest
         after, there = refined(asked, state, found, scale_px)
         calls.append(there.cost)
         late = len(calls) % adjustment.MAX_NUM_REFINEMENTS == 1 or len(calls) == 1
-        return after, there if late else replace(there, costs=there.costs + 1e6)
+        return after, there if late else replace(there, costs=1.1 * calls[0] / there.cost * there.costs)
 
     monkeypatch.setattr(adjustment, "_with_refined_points", gaining_late)
     monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 1)
@@ -333,3 +339,33 @@ def test_points_follow_a_step_that_gains_only_once_they_have(monkeypatch: pytest
     # Once at the start, then three times after the step, of which only the last one gains.
     assert len(calls) == 1 + adjustment.MAX_NUM_REFINEMENTS
     assert found.final_cost == calls[-1] < found.initial_cost
+
+
+@dataclass
+class Sphere:
+    """Longitude and latitude, for rays of all directions."""
+
+    free: np.ndarray
+
+    def project(self, parameters: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        return parameters[0] * np.stack(
+            [np.arctan2(rays[:, 0], rays[:, 2]), np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))], axis=1
+        )
+
+
+def test_derivatives_by_rays_of_all_directions_and_by_those_ahead() -> None:
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(40, 3))
+    x, y, z = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).T
+    flat = x**2 + z**2
+    expected = 300.0 * np.array(
+        [[z / flat, 0 * x, -x / flat], [-x * y / np.sqrt(flat), np.sqrt(flat), -y * z / np.sqrt(flat)]]
+    )
+    lens, parameters = Sphere(np.array([])), np.array([300.0])
+    every = np.stack([x, y, z], axis=1)
+    assert np.abs(z).min() < 0.1
+    np.testing.assert_allclose(_derivative_by_ray(lens, parameters, every), expected, atol=1e-5)
+    ahead = np.abs(z) > 0.2
+    np.testing.assert_allclose(
+        _derivative_by_ray(lens, parameters, every[ahead]), expected[:, :, ahead], atol=1e-5, rtol=1e-6
+    )
