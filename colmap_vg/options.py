@@ -96,6 +96,7 @@ class SolveOptions(_Checked):
     convergence_tolerance: float = _number(1e-6, 0.0, 1.0)  # relative change of positions between outer iterations
     covariances: bool = False  # compute those of poses in the epipolar adjustment; adds a fifth to the solver's time
     refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal length was not given
+    adjustment_tolerance: float = _number(1e-5, 0.0, 1.0)  # relative change of cost that ends the epipolar adjustment
     max_matches_per_edge: int = _number(500, 0)  # matches in the epipolar adjustment, spread over the image; 0: all
     random_seed: int = _number(0, 0)
 

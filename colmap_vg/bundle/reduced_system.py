@@ -138,14 +138,12 @@ def _blocks(
     for axis in range(3):
         for unknown in range(width):
             eliminated[:, axis, unknown] = np.einsum("ak,ak->k", derivatives[:, unknown], across[:, axis])
-    by_row = np.ascontiguousarray(derivatives.transpose(2, 0, 1))
-    residual_rows = np.ascontiguousarray(residuals.T)
-    point_rows = np.ascontiguousarray(np.take(of_points, problem.point_row, axis=1).T)
     own, gradient = np.empty((problem.num_images, width, width)), np.empty((problem.num_images, width))
-    for image, (start, end) in enumerate(zip(problem.starts[:-1], problem.starts[1:], strict=True)):
-        F, Z = by_row[start:end].reshape(-1, width), eliminated[start:end].reshape(-1, width)
+    for image, at in enumerate(problem.of_images):
+        F, Z = derivatives[:, :, at].transpose(2, 0, 1).reshape(-1, width), eliminated[at].reshape(-1, width)
         own[image] = F.T @ F - Z.T @ Z
-        gradient[image] = F.T @ residual_rows[start:end].ravel() - Z.T @ point_rows[start:end].ravel()
+        point_gradients = np.take(of_points, problem.point_row[at], axis=1).T.ravel()
+        gradient[image] = F.T @ residuals[:, at].T.ravel() - Z.T @ point_gradients
     pairs, place = np.empty((len(pattern.pairs), width, width)), 0
     for (first, second, _), cuts in zip(problem.common, pattern.cuts, strict=True):
         left, right = np.take(eliminated, first, axis=0), np.take(eliminated, second, axis=0)

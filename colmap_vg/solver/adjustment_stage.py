@@ -45,9 +45,10 @@ def adjust_poses(
     Reversed edges and outliers are dropped, and images whose positions the remaining edges do not determine.
     """
     directions = state.graph.cam2_in_cam1_directions[part.edge_rows]
-    found = adjust_epipolar(problem, poses.rotations, poses.centers, directions)
+    tolerance = options.adjustment_tolerance
+    found = adjust_epipolar(problem, poses.rotations, poses.centers, directions, tolerance=tolerance)
     state.log.extend(found.log)
-    problem, found = _with_radial_term(state, problem, found, directions)
+    problem, found = _with_radial_term(state, problem, found, directions, tolerance)
     state.drop(part.edge_rows[found.reversed_edges], EdgeVerdict.REVERSED)
     dropped = found.reversed_edges.copy()
     if problem.bent_cameras is None:  # relative poses from distorted rays are not comparable with those without
@@ -69,6 +70,7 @@ def adjust_poses(
             initial_lenses=found.cameras.lenses,
             scales_px=(found.scale_px,),
             final_sigmas=0.0,
+            tolerance=tolerance,
         )
         state.log.extend(again.log)
         state.drop(part.edge_rows[~dropped][again.reversed_edges], EdgeVerdict.REVERSED)
@@ -121,7 +123,7 @@ def _warn_of_uncertain(state: SolverState, part: Subgraph, centers: Array, covar
 
 
 def _with_radial_term(
-    state: SolverState, problem: EpipolarProblem, found: AdjustmentResult, directions: Array
+    state: SolverState, problem: EpipolarProblem, found: AdjustmentResult, directions: Array, tolerance: float
 ) -> tuple[EpipolarProblem, AdjustmentResult]:
     """Estimate a radial term if focal lengths are free; return the problem, with the term if there is one, solved."""
     graph, (group, first) = state.graph, focal_groups(state.graph)
@@ -141,6 +143,7 @@ def _with_radial_term(
         initial_lenses=start.cameras.lenses,
         scales_px=(start.scale_px,),
         near=True,
+        tolerance=tolerance,
     )
     state.log.extend(again.log)
     return lens.problem, again

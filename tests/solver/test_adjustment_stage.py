@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,21 @@ from colmap_vg.solver.state import SolverState
 NUM_IMAGES = 12
 
 
-def test_tracks_are_sought_again_where_the_dropped_pair_held_an_image(tmp_path: Path) -> None:
+def tolerances_asked(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The tolerances with which the epipolar adjustment is called from here on."""
+    asked: list[float] = []
+
+    def adjusted(*arguments: Any, tolerance: float, **options: Any) -> AdjustmentResult:
+        asked.append(tolerance)
+        return adjust_epipolar(*arguments, tolerance=tolerance, **options)
+
+    monkeypatch.setattr(adjustment_stage, "adjust_epipolar", adjusted)
+    return asked
+
+
+def test_tracks_are_sought_again_where_the_dropped_pair_held_an_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The last image has two pairs, one of them wrong: without it, directions leave its distance free."""
     poses, points = street(NUM_IMAGES, 3)
     last, right, wrong = NUM_IMAGES - 1, NUM_IMAGES - 2, NUM_IMAGES - 3
@@ -38,7 +53,9 @@ def test_tracks_are_sought_again_where_the_dropped_pair_held_an_image(tmp_path: 
     start = truth.copy()
     start[last] = truth[right] + 1.3 * (truth[last] - truth[right])
     given = PartPoses(np.array([pose.rotation.matrix() for pose in poses]), start, np.ones(1))
-    fixed, adjusted = adjust_poses(state, part, problem, given, SolveOptions())
+    asked = tolerances_asked(monkeypatch)
+    fixed, adjusted = adjust_poses(state, part, problem, given, SolveOptions(adjustment_tolerance=1e-6))
+    assert asked == [1e-6, 1e-6]
     assert np.flatnonzero(state.edge_verdicts != EdgeVerdict.KEPT).tolist() == [row]
     assert state.edge_verdicts[row] == EdgeVerdict.CONTRADICTS_POSES
     assert fixed.num_images == NUM_IMAGES
@@ -93,7 +110,9 @@ def test_the_radial_term_is_that_of_the_cameras_that_have_it(monkeypatch: pytest
     part, problem = whole(graph)
     # Pairs are computed from distorted rays, so that a comparison with the poses would mean nothing.
     monkeypatch.delattr(adjustment_stage, "_contradicting")
-    _, adjusted = adjust_poses(SolverState(graph), part, problem, poses, SolveOptions())
+    asked = tolerances_asked(monkeypatch)
+    _, adjusted = adjust_poses(SolverState(graph), part, problem, poses, SolveOptions(adjustment_tolerance=1e-6))
+    assert asked == [1e-6, 1e-6]
     assert adjusted.radial_terms is not None
     assert adjusted.radial_terms[0] == pytest.approx(-0.1, abs=0.01)
     np.testing.assert_array_equal(adjusted.radial_terms[1:], 0.0)
@@ -126,5 +145,5 @@ def test_a_term_is_sought_for_cameras_that_may_have_one(
 
     monkeypatch.setattr(adjustment_stage, "fit_radial_term", fit)
     found = replace(found, lost_focals=np.array(lost))
-    adjustment_stage._with_radial_term(SolverState(graph), problem, found, graph.cam2_in_cam1_directions)
+    adjustment_stage._with_radial_term(SolverState(graph), problem, found, graph.cam2_in_cam1_directions, 1e-5)
     assert [mask.tolist() for mask in asked] == ([] if tried is None else [tried])
