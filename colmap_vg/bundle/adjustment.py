@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 0.15
 """Root mean square of a step, in standard deviations of the unknowns, at which the adjustment ends."""
-TRIAL_TOLERANCE = 0.5
-"""The same where only the cost is asked for."""
+ROUGH_TOLERANCE = 0.5
+"""The same where only the cost is asked for, or another round follows."""
 MAX_NUM_STEPS = 40
 """Maximum number of steps."""
 MAX_NUM_REFINEMENTS = 3

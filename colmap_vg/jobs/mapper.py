@@ -370,7 +370,7 @@ def _with_database_cameras(
 ) -> "pycolmap.Reconstruction":
     """Give a model the database's own cameras; with the shared calibrations unless separate ones fit clearly better."""
     trial = with_database_cameras(cache, shared, replaced)
-    cost_ratio = adjust_once_more(cache, trial, options, trial=True)
+    cost_ratio = adjust_once_more(cache, trial, options, rough=True)
     if cost_ratio < SHARED_LENS_COST_RATIO:
         for _ in range(MAX_NUM_ROUNDS):
             if adjust_once_more(cache, trial, options) > CONVERGED_COST_RATIO:

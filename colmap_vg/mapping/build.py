@@ -33,11 +33,10 @@ what determines a pose."""
 
 MAX_NUM_ROUNDS = 6
 """Maximum number of rounds of bundle adjustment and retriangulation."""
-GOOD_START_COST_RATIO, CONVERGED_COST_RATIO = 0.5, 0.7
-"""Ratio of final to initial cost of a round at or above which it is the last (first round, later rounds): the remaining
-cost is noise. The first round also removes triangulation noise; its ratio is two thirds where the poses were good, and
-a third or less where they were not. After good poses a second round changed positions by 0.1 to 4 % and never improved
-them."""
+CONVERGED_COST_RATIO = 0.7
+"""Ratio of final to initial cost of a round at or above which it is the last: the remaining cost is noise. Never the
+first one, which is rough: it removes the noise of triangulation, after which tracks are longer and the scale of the
+loss is known. Ending there cost up to a tenth of the accuracy under normal noise."""
 CONVERGED_FOCAL_CHANGE = 0.01
 """Relative change of a focal length in one round above which another round follows, whatever the cost ratio."""
 WELL_INITIALIZED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
@@ -179,7 +178,8 @@ def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: Mappin
     """Alternate bundle adjustment and retriangulation; return whether they converged in `MAX_NUM_ROUNDS` rounds."""
     triangulator = triangulator_options(options)
     lenses = _focal_lengths(mapper.reconstruction)
-    cost_ratio, enough = _adjust(mapper, options, held), GOOD_START_COST_RATIO
+    _adjust(mapper, options, held, rough=True)
+    cost_ratio = 0.0
     for _ in range(MAX_NUM_ROUNDS):
         before, lenses = lenses, _focal_lengths(mapper.reconstruction)
         report_progress("tracks")
@@ -187,10 +187,10 @@ def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: Mappin
         report_progress("tracks")
         mapper.retriangulate(triangulator)
         _filter(mapper)
-        if cost_ratio >= enough and np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE:
+        settled = np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE
+        if cost_ratio >= CONVERGED_COST_RATIO and settled:
             return True
         cost_ratio = _adjust(mapper, options, held)
-        enough = CONVERGED_COST_RATIO
     return False
 
 
@@ -229,7 +229,7 @@ def adjust_once_more(
     reconstruction: "pycolmap.Reconstruction",
     options: MappingOptions,
     *,
-    trial: bool = False,
+    rough: bool = False,
     priors: Sequence["pycolmap.PosePrior"] = (),
 ) -> float:
     """Run one more round of bundle adjustment on a finished model, in place.
@@ -239,8 +239,8 @@ def adjust_once_more(
     cache : pycolmap.DatabaseCache
     reconstruction : pycolmap.Reconstruction
     options : MappingOptions
-    trial : bool
-        Only the cost is asked for: the adjustment ends early.
+    rough : bool
+        The adjustment ends early: only the cost is asked for, or another round follows.
     priors : sequence of pycolmap.PosePrior, optional
         See :func:`adjust_bundle`.
 
@@ -251,7 +251,7 @@ def adjust_once_more(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    share = _adjust(mapper, options, held_of(cache), trial=trial, priors=priors)
+    share = _adjust(mapper, options, held_of(cache), rough=rough, priors=priors)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     return share
@@ -262,12 +262,12 @@ def _adjust(
     options: MappingOptions,
     held: Held,
     *,
-    trial: bool = False,
+    rough: bool = False,
     priors: Sequence["pycolmap.PosePrior"] = (),
 ) -> float:
     """Run one round of bundle adjustment and filter the points; return the ratio of the final to the initial cost."""
     report_progress("bundle adjustment")
-    cost_ratio = adjust_bundle(mapper.reconstruction, options, trial=trial, priors=priors, held=held)
+    cost_ratio = adjust_bundle(mapper.reconstruction, options, rough=rough, priors=priors, held=held)
     _filter(mapper)
     return cost_ratio
 

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 import pycolmap.pyceres  # the type of a bundle adjustment's summary
 
-from colmap_vg.bundle.adjustment import TOLERANCE, TRIAL_TOLERANCE, adjust
+from colmap_vg.bundle.adjustment import ROUGH_TOLERANCE, TOLERANCE, adjust
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints, focal_length
 from colmap_vg.colmap_io.model_observations import ModelObservations
 from colmap_vg.mapping.bundle_problem import ModelProblem, has_rigs
@@ -53,7 +53,7 @@ def adjust_bundle(
     reconstruction: "pycolmap.Reconstruction",
     options: MappingOptions,
     *,
-    trial: bool = False,
+    rough: bool = False,
     priors: Sequence["pycolmap.PosePrior"] = (),
     held: Held = NOTHING_HELD,
 ) -> float:
@@ -65,8 +65,8 @@ def adjust_bundle(
     ----------
     reconstruction : pycolmap.Reconstruction
     options : MappingOptions
-    trial : bool
-        Only the cost is asked for: the adjustment ends early.
+    rough : bool
+        The adjustment ends early: only the cost is asked for, or another round follows.
     priors : sequence of pycolmap.PosePrior, optional
         Positions of three images or more in the frame of the reconstruction, with covariances in its unit; they fix
         the gauge.
@@ -82,12 +82,12 @@ def adjust_bundle(
     if not priors and not has_rigs(reconstruction):
         ratio = 1.0
         if model := ModelProblem.of(reconstruction, observed, options, MIN_TRACK_LENGTH, held.frames):
-            found = adjust(model.problem, model.state, scale, tolerance=TRIAL_TOLERANCE if trial else TOLERANCE)
+            found = adjust(model.problem, model.state, scale, tolerance=ROUGH_TOLERANCE if rough else TOLERANCE)
             model.write(found.state, reconstruction)
             ratio = found.final_cost / found.initial_cost if found.initial_cost > 0.0 else 1.0
         _move_remaining_points(reconstruction, observed, scale, held)
         return ratio
-    bundle = bundle_options(options, loss_scale_px=scale, trial=trial)
+    bundle = bundle_options(options, loss_scale_px=scale, rough=rough)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
         if reconstruction.image(image_id).frame_id not in held.frames:
@@ -112,7 +112,7 @@ def adjust_bundle(
     if before is not None and before.is_spoilt(reconstruction):
         before.restore(reconstruction)
         kept = replace(options, ba_refine_extra_params=False)
-        return adjust_bundle(reconstruction, kept, trial=trial, priors=priors, held=held)
+        return adjust_bundle(reconstruction, kept, rough=rough, priors=priors, held=held)
     _move_remaining_points(reconstruction, observed, scale, held, only_short=not held.frames)
     # Without observations pycolmap returns no Ceres summary.
     costs = getattr(summary, "ceres_summary", None)

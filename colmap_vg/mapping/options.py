@@ -13,8 +13,8 @@ MIN_TRACK_LENGTH = 3
 """Minimum number of views of points that adjust the cameras."""
 TOLERANCE, MAX_NUM_STEPS = 1e-5, 40
 """Relative change of the cost by a step at which bundle adjustment ends, and its maximum number of steps."""
-TRIAL_TOLERANCE = 1e-3
-"""The same where only the cost is asked for."""
+ROUGH_TOLERANCE = 1e-3
+"""The same where only the cost is asked for, or another round follows."""
 MIN_RESIDUALS_FOR_THREADS = 150_000
 """Residuals, two for each observation, below which one thread is as soon done and takes less of the processors."""
 
@@ -44,14 +44,14 @@ def mapper_options(options: MappingOptions) -> "pycolmap.IncrementalMapperOption
 
 
 def bundle_options(
-    options: MappingOptions, *, loss_scale_px: float, trial: bool = False
+    options: MappingOptions, *, loss_scale_px: float, rough: bool = False
 ) -> "pycolmap.BundleAdjustmentOptions":
     """Bundle adjustment options, with a Cauchy loss, which gave better results than Huber's.
 
     Each step is followed by steps of every point alone, until these gain little: three steps in all reach what
     forty others do not where the points determine the cameras loosely. The initial trust region is wide since the poses
-    are nearly right. A narrow one damps what is determined least, such as the bend of a long street. A trial, of which
-    only the cost is asked for, does without steps of the points and ends early.
+    are nearly right. A narrow one damps what is determined least, such as the bend of a long street. A rough adjustment
+    does without steps of the points and ends early.
     """
     bundle = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=options.ba_refine_focal_length,
@@ -64,8 +64,8 @@ def bundle_options(
     bundle.ceres.loss_function_scale = loss_scale_px
     bundle.ceres.min_num_residuals_for_cpu_multi_threading = MIN_RESIDUALS_FOR_THREADS
     solver = bundle.ceres.solver_options
-    solver.use_inner_iterations = not trial
-    solver.function_tolerance, solver.max_num_iterations = TRIAL_TOLERANCE if trial else TOLERANCE, MAX_NUM_STEPS
+    solver.use_inner_iterations = not rough
+    solver.function_tolerance, solver.max_num_iterations = ROUGH_TOLERANCE if rough else TOLERANCE, MAX_NUM_STEPS
     solver.initial_trust_region_radius = 1e12
     solver.num_threads = options.num_threads
     return bundle

@@ -342,9 +342,9 @@ def test_separate_lenses_are_tried_briefly_and_adjusted_to_the_end_where_they_ar
     asked, models = [], []
     ratios = iter([ratio, 0.5 * mapper.CONVERGED_COST_RATIO, 1.0])
 
-    def adjusted(_: object, model: pycolmap.Reconstruction, *__: object, trial: bool = False) -> float:
+    def adjusted(_: object, model: pycolmap.Reconstruction, *__: object, rough: bool = False) -> float:
         assert model is models[0]
-        asked.append(trial)
+        asked.append(rough)
         return next(ratios)
 
     def separate(*_: object) -> pycolmap.Reconstruction:

@@ -6,8 +6,8 @@ import pytest
 from colmap_vg.mapping.options import (
     MAX_NUM_STEPS,
     MIN_RESIDUALS_FOR_THREADS,
+    ROUGH_TOLERANCE,
     TOLERANCE,
-    TRIAL_TOLERANCE,
     bundle_options,
     mapper_options,
     triangulator_options,
@@ -35,8 +35,8 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
     assert (solver.max_num_iterations, solver.function_tolerance) == (MAX_NUM_STEPS, TOLERANCE)
     assert (solver.use_inner_iterations, solver.num_threads) == (True, 3)
     assert bundle.ceres.min_num_residuals_for_cpu_multi_threading == MIN_RESIDUALS_FOR_THREADS
-    solver = bundle_options(options, loss_scale_px=0.7, trial=True).ceres.solver_options
-    assert (solver.use_inner_iterations, solver.function_tolerance) == (False, TRIAL_TOLERANCE)
+    solver = bundle_options(options, loss_scale_px=0.7, rough=True).ceres.solver_options
+    assert (solver.use_inner_iterations, solver.function_tolerance) == (False, ROUGH_TOLERANCE)
     mapper = mapper_options(options)
     assert (mapper.abs_pose_refine_focal_length, mapper.abs_pose_refine_extra_params) == (switch, switch)
     assert (mapper.num_threads, mapper.random_seed) == (3, 7)

@@ -1,10 +1,10 @@
-"""One round of bundle adjustment: the scale and the trial that are asked for reach the solver and the short tracks."""
+"""One round of bundle adjustment: the scale and the rough that are asked for reach the solver and the short tracks."""
 
 import numpy as np
 import pycolmap
 import pytest
 
-from colmap_vg.bundle.adjustment import TOLERANCE, TRIAL_TOLERANCE, Adjusted
+from colmap_vg.bundle.adjustment import ROUGH_TOLERANCE, TOLERANCE, Adjusted
 from colmap_vg.bundle.problem import BundleProblem, BundleState
 from colmap_vg.mapping import build, bundle
 from colmap_vg.mapping.bundle import Held, adjust_bundle, held_of
@@ -29,9 +29,9 @@ def with_short_tracks(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
     return model
 
 
-@pytest.mark.parametrize("trial", [False, True])
+@pytest.mark.parametrize("rough", [False, True])
 def test_the_scale_of_the_residuals_and_the_trial_reach_the_adjustment(
-    trial: bool, monkeypatch: pytest.MonkeyPatch
+    rough: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
 
@@ -42,12 +42,12 @@ def test_the_scale_of_the_residuals_and_the_trial_reach_the_adjustment(
     monkeypatch.setattr(bundle, "loss_scale", lambda *_: 0.37)
     monkeypatch.setattr(bundle, "adjust", adjusted)
     pycolmap.set_random_seed(0)
-    assert adjust_bundle(pycolmap.synthesize_dataset(FEW_VIEWS), ONE_THREAD, trial=trial) == 0.25
-    assert asked == [(0.37, TRIAL_TOLERANCE if trial else TOLERANCE)]
+    assert adjust_bundle(pycolmap.synthesize_dataset(FEW_VIEWS), ONE_THREAD, rough=rough) == 0.25
+    assert asked == [(0.37, ROUGH_TOLERANCE if rough else TOLERANCE)]
 
 
-@pytest.mark.parametrize("trial", [False, True])
-def test_they_reach_ceres_where_cameras_are_a_rig(trial: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rough", [False, True])
+def test_they_reach_ceres_where_cameras_are_a_rig(rough: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, scales = [], []
 
     def made(*arguments: object, **named: object) -> pycolmap.BundleAdjustmentOptions:
@@ -63,26 +63,26 @@ def test_they_reach_ceres_where_cameras_are_a_rig(trial: bool, monkeypatch: pyte
     monkeypatch.setattr(bundle, "refine_points", refined)
     pycolmap.set_random_seed(0)
     model = with_short_tracks(pycolmap.synthesize_dataset(RIG))
-    adjust_bundle(model, ONE_THREAD, trial=trial, held=held_of(model))
-    assert asked == [{"loss_scale_px": 0.37, "trial": trial}]
+    adjust_bundle(model, ONE_THREAD, rough=rough, held=held_of(model))
+    assert asked == [{"loss_scale_px": 0.37, "rough": rough}]
     assert scales == [0.37]
 
 
-@pytest.mark.parametrize("trial", [False, True])
-def test_one_more_round_is_a_trial_where_that_is_asked_for(trial: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rough", [False, True])
+def test_one_more_round_is_a_trial_where_that_is_asked_for(rough: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def adjusted(*arguments: object, trial: bool, **options: object) -> float:
-        asked.append(trial)
-        return adjust_bundle(*arguments, trial=trial, **options)
+    def adjusted(*arguments: object, rough: bool, **options: object) -> float:
+        asked.append(rough)
+        return adjust_bundle(*arguments, rough=rough, **options)
 
     monkeypatch.setattr(build, "adjust_bundle", adjusted)
     pycolmap.set_random_seed(0)
     with pycolmap.Database.open(":memory:") as database:
         model = pycolmap.synthesize_dataset(FEW_VIEWS, database)
         cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
-    assert build.adjust_once_more(cache, model, ONE_THREAD, trial=trial) <= 1.0
-    assert asked == [trial]
+    assert build.adjust_once_more(cache, model, ONE_THREAD, rough=rough) <= 1.0
+    assert asked == [rough]
 
 
 def test_points_move_unless_held_frames_see_them_mostly() -> None:
