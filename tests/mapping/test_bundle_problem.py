@@ -191,7 +191,12 @@ def test_points_that_only_held_frames_see_are_left_out() -> None:
     model = noisy_model()
     frames = frozenset(model.image(i).frame_id for i in sorted(model.reg_image_ids())[:11])
     last = max(model.reg_image_ids())
+    for point_id in sorted(model.points3D)[::3]:
+        element = next(e for e in model.point3D(point_id).track.elements if e.image_id == last)
+        model.delete_observation(last, element.point2D_idx)
     seen_by_last = {p.point3D_id for p in model.image(last).get_observation_points2D()}
     problem = problem_of(model, OPTIONS, 3, frames)
     assert problem is not None
     assert set(problem.point_ids) == seen_by_last
+    # They are fixed, so what held images see of them tells nothing.
+    assert len(problem.problem.image_row) == len(seen_by_last) == 200
