@@ -34,6 +34,21 @@ def noisy_model() -> pycolmap.Reconstruction:
     return model
 
 
+def with_ids_backwards(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The model with the ids of its images in reverse order, and its cameras as they were."""
+    found, last = pycolmap.Reconstruction(), max(model.images) + 1
+    for camera in model.cameras.values():
+        found.add_camera_with_trivial_rig(pycolmap.Camera(camera.todict()))
+    for image_id, image in model.images.items():
+        keypoints = np.array([keypoint.xy for keypoint in image.points2D])
+        copy = pycolmap.Image(image.name, keypoints, image.camera_id, last - image_id)
+        found.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for point in model.points3D.values():
+        elements = [pycolmap.TrackElement(last - e.image_id, e.point2D_idx) for e in point.track.elements]
+        found.add_point3D(point.xyz, pycolmap.Track(elements))
+    return found
+
+
 def problem_of(
     model: pycolmap.Reconstruction,
     options: MappingOptions,
@@ -101,7 +116,7 @@ def test_the_state_of_a_model_is_written_back_as_it_was() -> None:
 
 
 def test_images_are_in_the_order_of_their_cameras_and_short_tracks_are_left_out() -> None:
-    model = noisy_model()
+    model = with_ids_backwards(noisy_model())
     short = sorted(model.points3D)[::4]
     for point_id in short:
         elements = [(e.image_id, e.point2D_idx) for e in model.point3D(point_id).track.elements]
@@ -111,6 +126,7 @@ def test_images_are_in_the_order_of_their_cameras_and_short_tracks_are_left_out(
     assert problem is not None
     cameras = [model.image(i).camera_id for i in problem.image_ids]
     assert cameras == sorted(cameras)
+    assert problem.image_ids != sorted(problem.image_ids)
     assert [problem.camera_ids[k] for k in problem.problem.camera_idx] == cameras
     assert problem.point_ids == [point_id for point_id in sorted(model.points3D) if point_id not in short]
     assert len(problem.problem.image_row) == sum(model.point3D(i).track.length() for i in problem.point_ids)
