@@ -38,7 +38,14 @@ FIRST_DAMPING, MAX_DAMPING = 1e-8, 1e4
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """An adjusted state, and the costs before and after in pixels squared."""
+    """A result of bundle adjustment.
+
+    Attributes
+    ----------
+    state : BundleState
+    initial_cost, final_cost : float
+        Robust costs, pixels squared.
+    """
 
     state: BundleState
     initial_cost: float
@@ -71,6 +78,8 @@ def adjust(
     found = linearize(problem, state, loss_scale_px)
     initial_cost, damping, growth = found.cost, 0.0, 2.0
     state, found = _with_refined_points(problem, state, found, loss_scale_px)
+    if not len(problem.free):
+        return Adjusted(state, initial_cost, found.cost)
     system = ReducedSystem.of(problem, pattern, state, found)
     for count in range(MAX_NUM_STEPS):
         report_progress(f"bundle adjustment, step {count + 1}")
@@ -92,7 +101,7 @@ def adjust(
             if there.cost < found.cost or there.cost > WITHIN_REACH * found.cost:
                 break
         if there.cost < found.cost:
-            gain = 2.0 * (found.cost - there.cost) / expected
+            gain = 2.0 * (found.cost - there.cost) / max(expected, np.finfo(np.float64).tiny)
             state, found, growth = trial, there, 2.0
             damping = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = damping if damping > FIRST_DAMPING else 0.0
