@@ -107,3 +107,27 @@ def test_points_move_unless_held_frames_see_them_mostly() -> None:
     off = {point_id: np.linalg.norm(model.point3D(point_id).xyz - truth[point_id]) for point_id in truth}
     assert np.median([off[k] for k in few]) < 0.3 * 0.02 * np.sqrt(3)
     assert np.min([off[k] for k in mostly]) > 0.9 * 0.02 * np.sqrt(3)
+
+
+@pytest.mark.parametrize("held", [(), (1,), (1, 2)])
+@pytest.mark.parametrize("with_rig", [False, True])
+def test_points_that_the_adjustment_leaves_follow_the_cameras(
+    held: tuple[int, ...], with_rig: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refined = []
+
+    def recorded(positions: np.ndarray, *_: object, scale_px: float) -> np.ndarray:
+        refined.append(len(positions))
+        return positions
+
+    monkeypatch.setattr(bundle, "refine_points", recorded)
+    pycolmap.set_random_seed(0)
+    model = with_short_tracks(pycolmap.synthesize_dataset(RIG if with_rig else FEW_VIEWS))
+    expected = 0
+    for point in model.points3D.values():
+        frames = [model.image(element.image_id).frame_id for element in point.track.elements]
+        short = len(frames) < 3 or (with_rig and len(held) > 0)  # Ceres moves no point that held frames see
+        expected += short and 2 * sum(frame in held for frame in frames) <= len(frames)
+    adjust_bundle(model, ONE_THREAD, held=held_of(model, frozenset(held)))
+    assert refined == ([expected] if expected else [])
+    assert (expected == 0) == (held == (1, 2))

@@ -127,6 +127,7 @@ def test_images_are_in_the_order_of_their_cameras_and_short_tracks_are_left_out(
     cameras = [model.image(i).camera_id for i in problem.image_ids]
     assert cameras == sorted(cameras)
     assert problem.image_ids != sorted(problem.image_ids)
+    assert (np.diff(problem.problem.image_row) >= 0).all()
     assert [problem.camera_ids[k] for k in problem.problem.camera_idx] == cameras
     assert problem.point_ids == [point_id for point_id in sorted(model.points3D) if point_id not in short]
     assert len(problem.problem.image_row) == sum(model.point3D(i).track.length() for i in problem.point_ids)
