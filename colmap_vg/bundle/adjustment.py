@@ -18,6 +18,7 @@ from colmap_vg.bundle.problem import BundleProblem, BundleState
 from colmap_vg.bundle.reduced_system import ReducedPattern, ReducedSystem
 from colmap_vg.events import report_progress
 from colmap_vg.linear.solvers import SingularMatrixError
+from colmap_vg.linear.threads import single_threaded_blas
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,7 @@ class Adjusted:
     final_cost: float
 
 
+@single_threaded_blas
 def adjust(
     problem: BundleProblem,
     state: BundleState,
@@ -73,6 +75,11 @@ def adjust(
         Scale of the Cauchy loss.
     tolerance : float
         Root mean square of a step, in standard deviations of the unknowns, at which the adjustment ends.
+
+    Returns
+    -------
+    Adjusted
+        Its cost is at most the initial one.
     """
     pattern = ReducedPattern(problem)
     found = linearize(problem, state, loss_scale_px)

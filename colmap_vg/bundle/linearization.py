@@ -90,6 +90,10 @@ def linearize(problem: BundleProblem, state: BundleState, loss_scale_px: float) 
     state : BundleState
     loss_scale_px : float
         Scale c of the loss ``c^2 log(1 + |r|^2 / c^2) / 2``.
+
+    Returns
+    -------
+    Linearization
     """
     positions = np.take(np.ascontiguousarray(state.points.T), problem.point_row, axis=1)
     rays = np.empty_like(positions)

@@ -99,6 +99,7 @@ class ReducedSystem:
         if len(self.free) < len(step):
             matrix = matrix[self.free][:, self.free]
         diagonal = matrix.diagonal()
+        # Images without observations do not move.
         least = np.finfo(np.float64).tiny + 1e-15 * diagonal.max(initial=0.0)
         level = np.maximum((damping + MIN_DAMPING) * diagonal, least)
         step[self.free] = -factorize(sp.csc_array(matrix + sp.diags_array(level))).solve(self.gradient[self.free])

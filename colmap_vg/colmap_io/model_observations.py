@@ -12,6 +12,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_vg.errors import OutputError
+
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -39,15 +41,24 @@ class ModelObservations:
 
     @classmethod
     def of(cls, reconstruction: "pycolmap.Reconstruction") -> Self:
-        """Collect the observations of a reconstruction."""
+        """Collect the observations of a reconstruction.
+
+        Raises
+        ------
+        OutputError
+            The temporary folder has no room for the model.
+        """
         with tempfile.TemporaryDirectory() as folder:
             reconstruction.write_binary(folder)
             content = (Path(folder) / "images.bin").read_bytes()
         found, place = {}, 8
+        _check_room(len(content) >= place)
         for _ in range(int.from_bytes(content[:8], "little")):
             image_id = int.from_bytes(content[place : place + 4], "little")
-            place = content.index(b"\0", place + _POSE_AND_CAMERA) + 1
+            place = content.find(b"\0", place + _POSE_AND_CAMERA) + 1
+            _check_room(place > 0)
             count = int.from_bytes(content[place : place + 8], "little")
+            _check_room(place + 8 + count * _KEYPOINT.itemsize <= len(content))
             keypoints = np.frombuffer(content, _KEYPOINT, count, place + 8)
             found[image_id] = keypoints[keypoints["point_id"] != _NO_POINT]
             place += 8 + count * _KEYPOINT.itemsize
@@ -56,4 +67,12 @@ class ModelObservations:
             image_ids=np.repeat(sorted(found), [len(found[image_id]) for image_id in sorted(found)]).astype(np.int64),
             point_ids=rows["point_id"].astype(np.int64),
             keypoints=np.ascontiguousarray(rows["xy"]),
+        )
+
+
+def _check_room(is_whole: bool) -> None:
+    if not is_whole:
+        raise OutputError(
+            f"{tempfile.gettempdir()}: the model does not fit into the temporary folder. Free some space, or set TMPDIR"
+            " to a larger one."
         )

@@ -59,7 +59,7 @@ def adjust_bundle(
 ) -> float:
     """Adjust cameras and points, in place.
 
-    Where distortion coefficients run away so far that points lose their projections, they are not refined.
+    Where Ceres lets distortion coefficients run away so far that points lose their projections, they are not refined.
 
     Parameters
     ----------

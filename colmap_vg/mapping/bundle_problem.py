@@ -68,10 +68,25 @@ class ModelProblem:
         min_track_length: int,
         held_frames: frozenset[int] = frozenset(),
     ) -> "ModelProblem | None":
-        """Collect the points with tracks of some length; None without any.
+        """Collect what is adjusted, and what it depends on.
 
-        Frames that are held keep their poses and lenses, and the points that they see in more than half of their
-        observations.
+        Parameters
+        ----------
+        reconstruction : pycolmap.Reconstruction
+            Without rigs of several sensors.
+        seen : ModelObservations
+            Of the reconstruction.
+        options : MappingOptions
+        min_track_length : int
+            Points with fewer observations are left out.
+        held_frames : frozenset of int
+            Ids of frames that keep their poses and lenses, and the points that they see in more than half of their
+            observations.
+
+        Returns
+        -------
+        ModelProblem or None
+            None without points.
         """
         images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
         images.sort(key=lambda image: (image.camera_id, image.image_id))

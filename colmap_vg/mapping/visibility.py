@@ -72,7 +72,7 @@ def sampled_tracks(
 
 
 def observed_points(reconstruction: "pycolmap.Reconstruction", image_ids: list[int]) -> tuple[IntArray, IntArray]:
-    """Ids of the points that the registered images observe, and the row of the image, for each observation: (k,)."""
+    """Ids of observed points, and the row of the image among all registered ones, in the order of ids: (k,) each."""
     seen = ModelObservations.of(reconstruction)
     return seen.point_ids, np.searchsorted(image_ids, seen.image_ids)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bundle_scenes import displaced, plain_residuals, scene
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from colmap_vg.bundle import adjustment
 from colmap_vg.bundle.adjustment import adjust
@@ -254,3 +255,17 @@ def test_a_scene_that_fits_exactly_stays() -> None:
     found = adjust(exact, truth, 1.0)
     assert found.final_cost == pytest.approx(0.0, abs=1e-18)
     np.testing.assert_allclose(found.state.centers, truth.centers, atol=1e-9)
+
+
+def test_blas_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = scene(sigma_px=0.5)
+    threads = set[int]()
+
+    def observed(*arguments: object) -> Linearization:
+        threads.update(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        return linearize(*arguments)
+
+    monkeypatch.setattr(adjustment, "linearize", observed)
+    with threadpool_limits(2, "blas"):
+        adjust(problem, displaced(problem, truth, 0.01), 1.0)
+    assert threads == {1}

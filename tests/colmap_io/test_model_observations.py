@@ -1,9 +1,13 @@
 """Observations of a model as arrays: those that pycolmap tells one by one."""
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
+import pytest
 
 from colmap_vg.colmap_io.model_observations import ModelObservations
+from colmap_vg.errors import OutputError
 
 
 def test_they_are_those_of_the_registered_images() -> None:
@@ -33,3 +37,21 @@ def test_a_model_without_images_has_none() -> None:
     assert found.keypoints.shape == (0, 2)
     assert len(found.image_ids) == len(found.point_ids) == 0
     assert found.image_ids.dtype == np.int64
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
+def test_a_temporary_folder_without_room_is_told(share: float) -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=3, num_points3D=50))
+
+    class CutOff:
+        """Writes a part of the model's images."""
+
+        def write_binary(self, folder: str) -> None:
+            model.write_binary(folder)
+            path = Path(folder) / "images.bin"
+            content = path.read_bytes()
+            path.write_bytes(content[: int(share * len(content))])
+
+    with pytest.raises(OutputError, match="does not fit into the temporary folder"):
+        ModelObservations.of(CutOff())
