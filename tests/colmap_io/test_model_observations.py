@@ -39,7 +39,7 @@ def test_a_model_without_images_has_none() -> None:
     assert found.image_ids.dtype == np.int64
 
 
-@pytest.mark.parametrize("size", [0, 40, 5000, -1])
+@pytest.mark.parametrize("size", [0, 40, 85, 5000, -1])
 def test_a_temporary_folder_without_room_is_told(size: int) -> None:
     pycolmap.set_random_seed(0)
     model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=3, num_points3D=50))
