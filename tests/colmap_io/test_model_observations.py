@@ -39,18 +39,19 @@ def test_a_model_without_images_has_none() -> None:
     assert found.image_ids.dtype == np.int64
 
 
-@pytest.mark.parametrize("size", [0, 40, 85, 5000, -1])
-def test_a_temporary_folder_without_room_is_told(size: int) -> None:
+@pytest.mark.parametrize("size", [0, 40, 5000, -1, None])
+def test_a_temporary_folder_without_room_is_told(size: int | None) -> None:
     pycolmap.set_random_seed(0)
     model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=3, num_points3D=50))
 
     class CutOff:
-        """Writes a part of the model's images."""
+        """Writes a part of the model's images, which ends within the last one's name if no size is given."""
 
         def write_binary(self, folder: str) -> None:
             model.write_binary(folder)
             path = Path(folder) / "images.bin"
-            path.write_bytes(path.read_bytes()[:size])
+            content, last = path.read_bytes(), model.image(max(model.images)).name
+            path.write_bytes(content[: content.index(last.encode()) + 3 if size is None else size])
 
     with pytest.raises(OutputError, match="does not fit into the temporary folder"):
         ModelObservations.of(CutOff())
