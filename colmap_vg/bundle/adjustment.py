@@ -81,7 +81,7 @@ def adjust(
     Adjusted
         Its cost is at most the initial one.
     """
-    pattern = ReducedPattern(problem)
+    pattern, viewed = ReducedPattern(problem), state.viewed(problem)
     found = linearize(problem, state, loss_scale_px)
     initial_cost, damping, growth = found.cost, 0.0, 2.0
     state, found = _with_refined_points(problem, state, found, loss_scale_px)
@@ -101,7 +101,7 @@ def adjust(
         short = expected <= tolerance**2 * found.variance * len(problem.free)
         step = found.relaxation * step
         points = state.points + system.steps_of_points(problem, step, found.relaxation)
-        trial = state.moved(problem, step, points)
+        trial = state.moved(problem, step, points, viewed)
         there = linearize(problem, trial, loss_scale_px)
         for _ in range(MAX_NUM_REFINEMENTS):
             trial, there = _with_refined_points(problem, trial, there, loss_scale_px)

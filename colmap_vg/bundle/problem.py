@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
 
+MAX_GROWTH = 2.0
+"""Maximum change, either way, of the logarithm of a focal length or of a distance in one step."""
+
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -22,6 +25,10 @@ class Lens(Protocol):
     @property
     def free(self) -> IntArray:
         """Indices (t,) of the parameters that are unknown."""
+
+    @property
+    def focal(self) -> BoolArray:
+        """Which of these are focal lengths: (t,)."""
 
     def project(self, parameters: Array, rays: Array) -> Array:
         """Project rays (k, 3) of the camera's frame: pixels (k, 2), NaN where a ray has no projection."""
@@ -143,13 +150,36 @@ class BundleState:
     points: Array
     parameters: list[Array] = field(default_factory=list)
 
-    def moved(self, problem: BundleProblem, step: Array, points: Array) -> "BundleState":
-        """Take a step (u,) of the unknowns, with new points (q, 3)."""
+    def viewed(self, problem: BundleProblem) -> Array:
+        """What each image looks at: (n, 3), the harmonic mean of the distances of its points away."""
+        n, row = problem.num_images, problem.image_row
+        rays = self.points[problem.point_row] - self.centers[row]
+        nearness = 1.0 / np.maximum(np.linalg.norm(rays, axis=1), np.finfo(np.float64).tiny)
+        ahead = np.stack([np.bincount(row, nearness * rays[:, axis], minlength=n) for axis in range(3)], axis=1)
+        ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1), np.finfo(np.float64).tiny)[:, None]
+        count, total = np.bincount(row, minlength=n), np.bincount(row, nearness, minlength=n)
+        distance = count / np.maximum(total, np.finfo(np.float64).tiny)
+        return np.asarray(self.centers + distance[:, None] * ahead)
+
+    def moved(self, problem: BundleProblem, step: Array, points: Array, viewed: Array) -> "BundleState":
+        """Take a step (u,) of the unknowns, with new points (q, 3).
+
+        Focal lengths and distances from what an image looks at, `viewed` (n, 3), are multiplied, not added to: it is
+        their ratios that keypoints tell, so that what hardly changes the cost is straight in their logarithms.
+        """
         poses = step[: 6 * problem.num_images].reshape(-1, 6)
         parameters, place = [], 6 * problem.num_images
         for lens, before in zip(problem.lenses, self.parameters, strict=True):
             after, end = before.copy(), place + len(lens.free)
-            after[lens.free] += step[place:end]
+            own, by = before[lens.free], step[place:end]
+            growth = np.clip(by / np.where(lens.focal, own, np.inf), -MAX_GROWTH, MAX_GROWTH)
+            after[lens.free] = np.where(lens.focal, own * np.exp(growth), own + by)
             parameters.append(after)
             place = end
-        return BundleState(self.rotations @ so3.exp(poses[:, :3]), self.centers + poses[:, 3:], points, parameters)
+        away = self.centers - viewed
+        squared = np.maximum(np.einsum("na,na->n", away, away), np.finfo(np.float64).tiny)
+        growth = (np.einsum("na,na->n", away, poses[:, 3:]) / squared)[:, None]
+        sideways = poses[:, 3:] - growth * away
+        growth = np.clip(growth, -MAX_GROWTH, MAX_GROWTH)
+        centers = self.centers + np.expm1(growth) * away + np.exp(growth) * sideways
+        return BundleState(self.rotations @ so3.exp(poses[:, :3]), centers, points, parameters)

@@ -33,6 +33,7 @@ class ColmapLens:
         free += list(camera.principal_point_idxs()) if options.ba_refine_principal_point else []
         free += list(camera.extra_params_idxs()) if options.ba_refine_extra_params else []
         self.free: IntArray = np.array([] if held else free, dtype=np.int64)
+        self.focal = np.isin(self.free, list(camera.focal_length_idxs()))
 
     def project(self, parameters: Array, rays: Array) -> Array:
         """Project rays (k, 3) of the camera's frame: pixels (k, 2), NaN where a ray has no projection."""

@@ -28,7 +28,7 @@ def jacobian(problem: BundleProblem, state: BundleState, scale: float) -> tuple[
         for sign in (1.0, -1.0):
             step = np.zeros(u + 3 * q)
             step[unknown] = sign * 1e-6
-            moved = state.moved(problem, step[:u], state.points + step[u:].reshape(-1, 3))
+            moved = state.moved(problem, step[:u], state.points + step[u:].reshape(-1, 3), state.viewed(problem))
             ends.append(plain_residuals(problem, moved))
         columns.append(weights * (ends[0] - ends[1]) / 2e-6)
     return np.stack(columns, axis=1), weights * plain_residuals(problem, state)

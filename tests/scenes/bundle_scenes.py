@@ -16,6 +16,10 @@ class Pinhole:
 
     free: np.ndarray
 
+    @property
+    def focal(self) -> np.ndarray:
+        return self.free == 0
+
     def project(self, parameters: np.ndarray, rays: np.ndarray) -> np.ndarray:
         f, x, y, k = parameters
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -62,7 +66,8 @@ def displaced(problem: BundleProblem, state: BundleState, size: float, seed: int
     for lens in problem.lenses:
         assert len(lens.free) in (0, 2)
     step[6 * n :: 2] *= FOCAL
-    return state.moved(problem, step, state.points + size * rng.normal(size=state.points.shape))
+    points = state.points + size * rng.normal(size=state.points.shape)
+    return state.moved(problem, step, points, state.viewed(problem))
 
 
 def plain_residuals(problem: BundleProblem, state: BundleState) -> np.ndarray:
