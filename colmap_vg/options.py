@@ -68,6 +68,7 @@ class ReadOptions(_Checked):
     min_num_inliers: int = _number(15, 5)  # verified matches; edges with fewer are in the graph but not used
     trust_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: decided from the two-view geometries
     find_distortion: bool = True  # estimate a radial term for cameras without distortion whose model has one
+    max_matches_per_pose: int = _number(1000, 5)  # matches that refine an edge's pose, evenly from its list
     max_num_inliers_per_edge: int = _number(0, 0)  # matches kept as bearings per edge, evenly from its list; 0: all
     excluded_pairs_path: str | PathLike[str] | None = None  # file with two image names per line: pairs not to use
     trusted_pairs_path: str | PathLike[str] | None = None  # file with two image names per line: pairs never dropped
@@ -98,6 +99,7 @@ class SolveOptions(_Checked):
     refine_focal_lengths: Literal["auto", "always", "never"] = "auto"  # auto: cameras whose focal length was not given
     adjustment_tolerance: float = _number(1e-5, 0.0, 1.0)  # relative change of cost that ends the epipolar adjustment
     max_matches_per_edge: int = _number(500, 0)  # matches in the epipolar adjustment, spread over the image; 0: all
+    max_tracks_per_triplet: int = _number(60, 0)  # tracks through three images in the epipolar adjustment; 0: all
     random_seed: int = _number(0, 0)
 
 

@@ -1,4 +1,4 @@
-"""The observations of a COLMAP model as arrays.
+"""The points of a COLMAP model and their observations as arrays.
 
 Asking pycolmap for each keypoint takes 3 microseconds; COLMAP writes all of them into a file in a tenth of that time.
 """
@@ -20,12 +20,14 @@ IntArray = NDArray[np.int64]
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
 _POSE_AND_CAMERA = 4 + 7 * 8 + 4
 """Bytes of an image's id, pose and camera in COLMAP's binary file, before its name."""
+_POINT, _TRACK_LENGTH, _TRACK_ELEMENT = 8 + 3 * 8, 8 + 3 * 8 + 3 + 8, 8
+"""Bytes of a point's id and position, those before the length of its track, and those of an image and its keypoint."""
 _NO_POINT = np.iinfo(np.uint64).max
 
 
 @dataclass(frozen=True, eq=False)
 class ModelObservations:
-    """Observations of all points in the registered images of a model.
+    """Points of a model and their observations in its registered images.
 
     Attributes
     ----------
@@ -33,15 +35,21 @@ class ModelObservations:
         Image and point of each observation; images ascend.
     keypoints : (k, 2) array
         Pixels.
+    every_point : (q,) int64 array
+        Ids of all points, ascending.
+    positions : (q, 3) array
+        World frame.
     """
 
     image_ids: IntArray
     point_ids: IntArray
     keypoints: Array
+    every_point: IntArray
+    positions: Array
 
     @classmethod
     def of(cls, reconstruction: "pycolmap.Reconstruction") -> Self:
-        """Collect the observations of a reconstruction.
+        """Collect the points and observations of a reconstruction.
 
         Raises
         ------
@@ -51,6 +59,7 @@ class ModelObservations:
         with tempfile.TemporaryDirectory() as folder:
             reconstruction.write_binary(folder)
             content = (Path(folder) / "images.bin").read_bytes()
+            every_point, positions = _points((Path(folder) / "points3D.bin").read_bytes())
         found, place = {}, 8
         _check_room(len(content) >= place)
         for _ in range(int.from_bytes(content[:8], "little")):
@@ -67,7 +76,28 @@ class ModelObservations:
             image_ids=np.repeat(sorted(found), [len(found[image_id]) for image_id in sorted(found)]).astype(np.int64),
             point_ids=rows["point_id"].astype(np.int64),
             keypoints=np.ascontiguousarray(rows["xy"]),
+            every_point=every_point,
+            positions=positions,
         )
+
+    def positions_of(self, point_ids: IntArray) -> Array:
+        """Positions (n, 3) of some points of the model."""
+        return np.asarray(self.positions[np.searchsorted(self.every_point, point_ids)])
+
+
+def _points(content: bytes) -> tuple[IntArray, Array]:
+    """Ids (q,), ascending, and positions (q, 3) of the points in COLMAP's binary file."""
+    _check_room(len(content) >= 8)
+    starts, place = [], 8
+    for _ in range(int.from_bytes(content[:8], "little")):
+        starts.append(place)
+        length = place + _TRACK_LENGTH
+        place = length + 8 + _TRACK_ELEMENT * int.from_bytes(content[length : length + 8], "little")
+    _check_room(place == len(content))
+    places = np.array(starts, dtype=np.int64)[:, None] + np.arange(_POINT)
+    heads = np.frombuffer(content, np.uint8)[places].view(np.dtype([("id", "<u8"), ("xyz", "<f8", 3)])).reshape(-1)
+    order = np.argsort(heads["id"], kind="stable")
+    return heads["id"][order].astype(np.int64), np.ascontiguousarray(heads["xyz"][order])
 
 
 def _check_room(is_whole: bool) -> None:

@@ -131,7 +131,7 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
     graph : ViewGraph
     part : Subgraph
     options : SolveOptions
-        `refine_focal_lengths` and `max_matches_per_edge`.
+        `refine_focal_lengths`, `max_matches_per_edge` and `max_tracks_per_triplet`.
 
     Returns
     -------
@@ -162,6 +162,7 @@ def epipolar_problem(graph: ViewGraph, part: Subgraph, options: SolveOptions) ->
             rays1[rows],
             rays2[rows],
             graph.cam2_from_cam1_rotations[part.edge_rows],
+            options.max_tracks_per_triplet,
         )
     # Triplets are formed from all matches: subsampled pairs share few tracks.
     report_progress("tracks")

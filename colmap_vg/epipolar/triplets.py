@@ -25,8 +25,6 @@ HALF_EDGES_PER_IMAGE = 24
 """Maximum number of half-edges per image that are paired, those of highest score: the number of pairs is quadratic."""
 TRIPLETS_PER_IMAGE = 6
 """Maximum number of triplets with the same middle image, apart from those of the spanning forest."""
-TRACKS_PER_TRIPLET = 60
-"""Maximum number of tracks per triplet."""
 MIN_TRACKS = 10
 """Minimum number of shared keypoints of a triplet."""
 
@@ -83,6 +81,7 @@ def find_triplets(
     bearings1: Array,
     bearings2: Array,
     relative_rotations: Array,
+    max_num_tracks: int,
 ) -> Triplets:
     """Select triplets by the score of their shared tracks.
 
@@ -97,11 +96,13 @@ def find_triplets(
         Unit rays of the matches.
     relative_rotations : (m, 3, 3) array
         cam2_from_cam1 rotations, used for the angles between rays.
+    max_num_tracks : int
+        Maximum number of tracks per triplet; 0: all.
 
     Returns
     -------
     Triplets
-        About `TRIPLETS_PER_IMAGE` per middle image, with at most `TRACKS_PER_TRIPLET` tracks each.
+        About `TRIPLETS_PER_IMAGE` per middle image.
     """
     m, k = len(edges), len(bearings1)
     turned = np.einsum("kab,kb->ka", relative_rotations[segment_of_rows(offsets)], bearings1)
@@ -118,7 +119,7 @@ def find_triplets(
     first, second = _join(pairs, half_offsets, keypoints)
     shared = np.concatenate([[0], np.cumsum(np.bincount(first[0], minlength=len(pairs)))]).astype(np.int64)
     report_progress("tracks")
-    kept = evenly_thinned(shared, TRACKS_PER_TRIPLET)
+    kept = evenly_thinned(shared, max_num_tracks)
     of_other, of_middle = np.concatenate([bearings2, bearings1]), np.concatenate([bearings1, bearings2])
     in_other = np.concatenate([keypoints2, keypoints1]).astype(np.int64)
     report_progress("tracks")

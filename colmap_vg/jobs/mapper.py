@@ -41,8 +41,6 @@ from colmap_vg.solver.state import described
 SHARED_LENS_COST_RATIO = 0.8
 """Ratio of final to initial cost of bundle adjustment with one calibration per camera, below which shared calibrations
 are given up. With a single lens it was 0.98 to 0.99 for images with many observations, 0.89 for those with few."""
-ROUGH_MATCHES = 100
-"""Maximum number of matches per pair in the solutions that are compared by their points."""
 FALSE_PAIRS = (EdgeVerdict.EXCLUDED, EdgeVerdict.ROTATION_OUTLIER)
 """Verdicts of pairs that are excluded from triangulation: the user's, and those with a rotation error beyond noise."""
 
@@ -305,7 +303,7 @@ def _second_opinion(
     """Choose among a solution's arrangements of the images by their missing correspondences."""
     with log.stage("second opinion"):
         # All arrangements are solved with the same reduced effort, so that the comparison is fair.
-        rough = replace(solve_options(options), refine_focal_lengths="never", max_matches_per_edge=ROUGH_MATCHES)
+        rough = replace(solve_options(options), refine_focal_lengths="never")
         found = [
             _point_evidence(database_path, work, graph, solve_view_graph(graph, rough, rotations), options)
             for rotations in solution.arrangements

@@ -101,7 +101,6 @@ class ModelProblem:
             return None
         used = np.flatnonzero(kept[point_row] & ~(held[image_row] & fixed[point_row]))
         used = used[np.argsort(image_row[used], kind="stable")]
-        point_ids = every[kept].tolist()
         camera_ids = sorted({image.camera_id for image in images})
         cameras = [reconstruction.camera(camera_id) for camera_id in camera_ids]
         of_held = {image.camera_id for image, stays in zip(images, held, strict=True) if stays}
@@ -120,10 +119,10 @@ class ModelProblem:
         state = BundleState(
             rotations=np.array([image.cam_from_world().rotation.matrix() for image in images]),
             centers=np.array([image.projection_center() for image in images]),
-            points=np.array([reconstruction.point3D(point_id).xyz for point_id in point_ids]),
+            points=seen.positions_of(every[kept]),
             parameters=[np.array(camera.params, dtype=np.float64) for camera in cameras],
         )
-        return cls(problem, state, [image.image_id for image in images], camera_ids, point_ids)
+        return cls(problem, state, [image.image_id for image in images], camera_ids, every[kept].tolist())
 
     def write(self, state: BundleState, reconstruction: "pycolmap.Reconstruction") -> None:
         """Give the reconstruction the poses, lenses and points of a state."""

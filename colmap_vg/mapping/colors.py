@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.colmap_io.model_observations import ModelObservations
 from colmap_vg.events import StageLog
 from colmap_vg.features.pixels import decoded, stretched
 
@@ -38,11 +39,11 @@ def extract_colors(
     if image_path is None:
         return
     folder = Path(image_path)
-    ids = np.fromiter(reconstruction.points3D, dtype=np.uint64)
-    ids.sort()
-    total, count = np.zeros((len(ids), 3)), np.zeros(len(ids))
+    observed = ModelObservations.of(reconstruction)
+    rows = np.searchsorted(observed.every_point, observed.point_ids)
+    total, count = np.zeros((len(observed.every_point), 3)), np.zeros(len(observed.every_point))
     missing, unlike = [], []
-    for image_id in reconstruction.reg_image_ids():
+    for image_id in sorted(reconstruction.reg_image_ids()):
         image = reconstruction.image(image_id)
         camera = reconstruction.camera(image.camera_id)
         pixels = _read(folder / image.name)
@@ -53,15 +54,13 @@ def extract_colors(
         if abs(scale[0] / scale[1] - 1.0) > MAX_ASPECT_CHANGE:
             unlike.append(image.name)
             continue
-        seen = image.get_observation_points2D()
-        rows = np.searchsorted(ids, np.array([point.point3D_id for point in seen], dtype=np.uint64))
-        seen_colors = interpolated(pixels, np.array([point.xy for point in seen]).reshape(-1, 2) * scale)
-        total[rows] += seen_colors[:, ::-1]
-        count[rows] += 1.0
+        own = slice(*np.searchsorted(observed.image_ids, [image_id, image_id + 1]))
+        total[rows[own]] += interpolated(pixels, observed.keypoints[own] * scale)[:, ::-1]
+        count[rows[own]] += 1.0
     _warn(missing, f"are missing in {folder} or cannot be read", reconstruction, log)
     _warn(unlike, f"differ in aspect ratio from the files in {folder}", reconstruction, log)
     colors = np.round(total / np.maximum(count, 1.0)[:, None]).astype(np.uint8)
-    for point_id, color in zip(ids.tolist(), colors, strict=True):
+    for point_id, color in zip(observed.every_point.tolist(), colors, strict=True):
         reconstruction.point3D(point_id).color = color
 
 

@@ -53,8 +53,7 @@ class Observations:
         own = np.flatnonzero(point_ids[np.minimum(place, len(point_ids) - 1)] == seen.point_ids)
         image_ids, image_row = np.unique(seen.image_ids[own], return_inverse=True)
         images = [reconstruction.image(image_id) for image_id in image_ids.tolist()]
-        positions = np.array([reconstruction.point3D(point_id).xyz for point_id in point_ids.tolist()])
-        return cls(positions, place[own], image_row.reshape(-1), images, seen.keypoints[own])
+        return cls(seen.positions_of(point_ids), place[own], image_row.reshape(-1), images, seen.keypoints[own])
 
     @property
     def rotations(self) -> Array:

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_vg.mapping.visibility import observed_points
+from colmap_vg.colmap_io.model_observations import ModelObservations
 
 Array = NDArray[np.float64]
 
@@ -29,17 +29,17 @@ def supported_observations(
     dict of image id to int
     """
     registered = sorted(reconstruction.reg_image_ids())
-    point_ids, image_row = observed_points(reconstruction, registered)
-    _, row, length = np.unique(point_ids, return_inverse=True, return_counts=True)
+    seen = ModelObservations.of(reconstruction)
+    image_row = np.searchsorted(registered, seen.image_ids)
+    _, row, length = np.unique(seen.point_ids, return_inverse=True, return_counts=True)
     by_point = np.argsort(row, kind="stable")
     by_point = by_point[length[row[by_point]] >= min_track_length]
     image_row = image_row[by_point]
-    long, point_row = np.unique(point_ids[by_point], return_inverse=True)
+    long, point_row = np.unique(seen.point_ids[by_point], return_inverse=True)
     if len(long) == 0:
         return dict.fromkeys(registered, 0)
     centers = np.array([reconstruction.image(i).projection_center() for i in registered])
-    positions = np.array([reconstruction.point3D(i).xyz for i in long.tolist()])
-    rays = centers[image_row] - positions[point_row]
+    rays = centers[image_row] - seen.positions_of(long)[point_row]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     offsets = np.searchsorted(point_row, np.arange(len(long) + 1))
     wide = _widest_angles(rays, offsets) >= np.radians(min_angle_deg)

@@ -27,14 +27,17 @@ class SampledTracks:
 
     Attributes
     ----------
+    every : (q, 3) array
+        All points of the model, world frame.
     points : (k, 3) array
-        World frame.
+        The sample.
     sees : (k, n) bool array
         Whether each image sees each point.
     num_observations : int
         Number of observations of all such points, sampled or not.
     """
 
+    every: Array
     points: Array
     sees: BoolArray
     num_observations: int
@@ -54,27 +57,22 @@ def sampled_tracks(
     """
     n = len(image_ids)
     # Each image once, even if it sees a point at two keypoints.
-    observed, image_row = observed_points(reconstruction, image_ids)
-    observed, image_row = np.divmod(np.unique(observed * n + image_row), n)
+    seen = ModelObservations.of(reconstruction)
+    image_row = np.searchsorted(image_ids, seen.image_ids)
+    observed, image_row = np.divmod(np.unique(seen.point_ids * n + image_row), n)
     point_ids, point_row, length = np.unique(observed, return_inverse=True, return_counts=True)
     by_length = np.argsort(length, kind="stable")
     by_length = by_length[length[by_length] >= MIN_TRACK_LENGTH]
     if not len(by_length):
-        return SampledTracks(np.zeros((0, 3)), np.zeros((0, n), dtype=bool), 0)
+        return SampledTracks(seen.positions, np.zeros((0, 3)), np.zeros((0, n), dtype=bool), 0)
     sampled = by_length[np.unique(np.linspace(0, len(by_length) - 1, max_num_points).astype(int))]
     row_of = np.full(len(point_ids), -1)
     row_of[sampled] = np.arange(len(sampled))
     counted = row_of[point_row] >= 0
     sees = np.zeros((len(sampled), n), dtype=bool)
     sees[row_of[point_row[counted]], image_row[counted]] = True
-    positions = np.array([reconstruction.point3D(i).xyz for i in point_ids[sampled].tolist()])
-    return SampledTracks(positions, sees, int(length[by_length].sum()))
-
-
-def observed_points(reconstruction: "pycolmap.Reconstruction", image_ids: list[int]) -> tuple[IntArray, IntArray]:
-    """Ids of observed points, and the row of the image among all registered ones, in the order of ids: (k,) each."""
-    seen = ModelObservations.of(reconstruction)
-    return seen.point_ids, np.searchsorted(image_ids, seen.image_ids)
+    positions = seen.positions_of(point_ids[sampled])
+    return SampledTracks(seen.positions, positions, sees, int(length[by_length].sum()))
 
 
 def in_frame(reconstruction: "pycolmap.Reconstruction", image_ids: list[int], xyz: Array) -> BoolArray:

@@ -206,7 +206,7 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     rays = centers[image] - tracks.points[point]
     distance = np.linalg.norm(rays, axis=1)
     rays /= distance[:, None]
-    normals, flat = _normals(reconstruction, tracks.points)
+    normals, flat = _normals(tracks.every, tracks.points)
     facing = np.einsum("ka,ka->k", normals[point], rays)
     # Pair each sight of a point with each image that sees the point.
     seen = tracks.sees[point, image]
@@ -222,9 +222,8 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     return _Expected(point[sight], image[sight], image[near], seen[sight])
 
 
-def _normals(reconstruction: "pycolmap.Reconstruction", points: Array) -> tuple[Array, BoolArray]:
+def _normals(every: Array, points: Array) -> tuple[Array, BoolArray]:
     """Normals (k, 3), of either sign, of the surface through points (k, 3) and their neighbours, and if it is flat."""
-    every = np.array([point.xyz for point in reconstruction.points3D.values()])
     neighbors = every[cKDTree(every).query(points, min(NUM_NEIGHBORS, len(every)))[1]].reshape(len(points), -1, 3)
     deviations = neighbors - neighbors.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("kna,knb->kab", deviations, deviations))

@@ -106,9 +106,7 @@ def _graph(
     cameras = [with_focal_scale(c, s) for c, s in zip(tables.cameras, focals.scales, strict=True)]
     offsets, matches, bearings1, bearings2 = _rays_of_matches(tables, cameras)
     report_progress("relative poses")
-    geometry = relative_poses(
-        tables, focals.scales, focals.known, offsets, bearings1, bearings2, options.min_num_inliers
-    )
+    geometry = relative_poses(tables, focals.scales, focals.known, offsets, bearings1, bearings2, options)
     report_progress("relative poses")
     num_inliers = np.diff(offsets)
     thin = evenly_thinned(offsets, options.max_num_inliers_per_edge)

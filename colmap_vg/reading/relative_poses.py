@@ -22,6 +22,7 @@ from colmap_vg.colmap_io.tables import (
 )
 from colmap_vg.events import report_progress
 from colmap_vg.geometry.directions import normalized
+from colmap_vg.options import ReadOptions
 from colmap_vg.scene.verdicts import EdgeVerdict
 from colmap_vg.two_view.edge_information import refine_relative_poses
 from colmap_vg.two_view.eight_point import estimate_essential_from_inliers
@@ -64,8 +65,6 @@ coordinates of both matched points, median of the Rayleigh distribution) over 0.
 MIN_FITTING_SHARE, MIN_NUM_FITTING = 0.8, 100
 """Minimum share and number of matches that fit a calibrated pose, for a pair that COLMAP labelled uncalibrated under a
 trusted focal length to be used: false pairs of repeated structure reached 74 matches, and shares up to 0.96."""
-MAX_MATCHES_PER_POSE = 1000
-"""Maximum number of a pair's matches that refine its pose, sampled evenly from its list."""
 MAX_MATCHES_PER_CHOICE = 150
 """Maximum number of a pair's matches that compare candidate poses, whose errors differ greatly."""
 SAME_MATRIX = 1e-8
@@ -146,7 +145,7 @@ def relative_poses(
     offsets: IntArray,
     bearings1: Array,
     bearings2: Array,
-    min_num_inliers: int,
+    options: ReadOptions,
 ) -> PairGeometry:
     """Estimate the relative poses of all pairs, and give each a verdict.
 
@@ -161,15 +160,15 @@ def relative_poses(
         Matches of pair k are rows ``offsets[k]:offsets[k + 1]`` of the bearings.
     bearings1, bearings2 : (k, 3) array
         Unit vectors in the first and the second camera's frame.
-    min_num_inliers : int
-        Minimum number of matches of a pair that is used.
+    options : ReadOptions
+        `min_num_inliers` and `max_matches_per_pose`.
 
     Returns
     -------
     PairGeometry
     """
     every = _Matches(offsets, bearings1, bearings2)
-    matches = every.thinned(MAX_MATCHES_PER_POSE)
+    matches = every.thinned(options.max_matches_per_pose)
     cameras = tables.camera_idx[tables.pairs]
     K = np.array([calibration_matrix(c, s) for c, s in zip(tables.cameras, focal_scales, strict=True)])
     K = K.reshape(-1, 3, 3)
@@ -177,7 +176,7 @@ def relative_poses(
     unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
     poses = _initial_poses(tables, every.thinned(MAX_MATCHES_PER_CHOICE), K[cameras], planar, unchanged)
     focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
-    enough = np.diff(matches.offsets) >= max(min_num_inliers, 5)
+    enough = np.diff(matches.offsets) >= max(options.min_num_inliers, 5)
     refined = refine_relative_poses(
         matches.offsets,
         matches.bearings1,
@@ -203,7 +202,7 @@ def relative_poses(
         medians * pair_focal,
         still=still,
         refuted=focal_trusted[cameras].all(axis=1) & unfit,
-        few=num_matches < min_num_inliers,
+        few=num_matches < options.min_num_inliers,
     )
     return PairGeometry(final.rotations, final.directions, final.median_angles, refined.information, planar, verdicts)
 

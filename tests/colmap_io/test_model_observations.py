@@ -30,26 +30,34 @@ def test_they_are_those_of_the_registered_images() -> None:
     assert len(expected) > 100
     told = zip(found.image_ids.tolist(), found.point_ids.tolist(), *found.keypoints.T.tolist(), strict=True)
     assert list(told) == expected
+    assert found.every_point.tolist() == sorted(model.points3D)
+    np.testing.assert_array_equal(found.positions, [model.point3D(i).xyz for i in sorted(model.points3D)])
+    some = found.every_point[[7, 2, 2]]
+    np.testing.assert_array_equal(found.positions_of(some), [model.point3D(i).xyz for i in some.tolist()])
 
 
 def test_a_model_without_images_has_none() -> None:
     found = ModelObservations.of(pycolmap.Reconstruction())
     assert found.keypoints.shape == (0, 2)
-    assert len(found.image_ids) == len(found.point_ids) == 0
+    assert len(found.image_ids) == len(found.point_ids) == len(found.every_point) == 0
+    assert found.positions.shape == (0, 3)
     assert found.image_ids.dtype == np.int64
 
 
-@pytest.mark.parametrize("size", [0, 40, 5000, -1, None])
-def test_a_temporary_folder_without_room_is_told(size: int | None) -> None:
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("images", size) for size in (0, 40, 5000, -1, None)] + [("points3D", size) for size in (0, 30, 2000, -1)],
+)
+def test_a_temporary_folder_without_room_is_told(name: str, size: int | None) -> None:
     pycolmap.set_random_seed(0)
     model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=3, num_points3D=50))
 
     class CutOff:
-        """Writes a part of the model's images, which ends within the last one's name if no size is given."""
+        """Writes a part of one file, which ends within the last image's name if no size is given."""
 
         def write_binary(self, folder: str) -> None:
             model.write_binary(folder)
-            path = Path(folder) / "images.bin"
+            path = Path(folder) / f"{name}.bin"
             content, last = path.read_bytes(), model.image(max(model.images)).name
             path.write_bytes(content[: content.index(last.encode()) + 3 if size is None else size])
 

@@ -58,7 +58,7 @@ def with_triplets(problem, R, p, points, *, sigma_px=0.0, seed=0):
     keypoints = np.tile(np.arange(k, dtype=np.int32), len(edges))
     offsets, rays1, rays2 = k * np.arange(len(edges) + 1), *(rays[edges[:, s]].reshape(-1, 3) for s in (0, 1))
     i, j = edges.T
-    triplets = find_triplets(edges, offsets, keypoints, keypoints, rays1, rays2, R[j] @ np.swapaxes(R[i], 1, 2))
+    triplets = find_triplets(edges, offsets, keypoints, keypoints, rays1, rays2, R[j] @ np.swapaxes(R[i], 1, 2), 60)
     return replace(problem, offsets=offsets, bearings1=rays1, bearings2=rays2, triplets=triplets)
 
 

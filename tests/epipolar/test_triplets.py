@@ -46,9 +46,8 @@ def twin(edges, offsets, first, second, rays1, rays2, _):
 @pytest.mark.parametrize("seed", range(4))
 def test_all_shared_tracks_are_found(seed, monkeypatch):
     monkeypatch.setattr(module, "TRIPLETS_PER_IMAGE", 1000)
-    monkeypatch.setattr(module, "TRACKS_PER_TRIPLET", 0)
     given = matches(seed)
-    found = find_triplets(*given)
+    found = find_triplets(*given, 0)
     expected = {k: v for k, v in twin(*given).items() if len(v) >= module.MIN_TRACKS}
     assert len(expected) > 5
     assert len(found.images) == len(expected)
@@ -64,9 +63,8 @@ def test_all_shared_tracks_are_found(seed, monkeypatch):
 
 def test_limits_keep_the_worthiest_and_what_joins_edges(monkeypatch):
     monkeypatch.setattr(module, "TRIPLETS_PER_IMAGE", 3)
-    monkeypatch.setattr(module, "TRACKS_PER_TRIPLET", 11)
     given = matches(5)
-    found = find_triplets(*given)
+    found = find_triplets(*given, 11)
     assert np.diff(found.offsets).max() == 11
 
     def worth(tracks):
@@ -99,6 +97,7 @@ def test_pairs_of_one_pair_of_images_make_no_triplet():
         rays,
         rays,
         np.tile(np.eye(3), (2, 1, 1)),
+        60,
     )
     assert len(found.images) == 0
     assert found.bearings.shape == (3, 3, 0)
@@ -107,12 +106,18 @@ def test_pairs_of_one_pair_of_images_make_no_triplet():
 
 def test_few_shared_keypoints_make_no_triplet():
     given = matches(7, num_keypoints=9, share=1.0)
-    assert len(find_triplets(*given).images) == 0
+    assert len(find_triplets(*given, 60).images) == 0
 
 
 def test_no_matches_make_no_triplet():
     empty = np.zeros(0, dtype=np.int32)
     found = find_triplets(
-        np.array([[0, 1], [1, 2]]), np.zeros(3, int), empty, empty, *np.zeros((2, 0, 3)), np.tile(np.eye(3), (2, 1, 1))
+        np.array([[0, 1], [1, 2]]),
+        np.zeros(3, int),
+        empty,
+        empty,
+        *np.zeros((2, 0, 3)),
+        np.tile(np.eye(3), (2, 1, 1)),
+        60,
     )
     assert len(found.images) == 0

@@ -72,7 +72,7 @@ def _problem(edges, first, second, rays, R, n, free):
     edge = np.repeat(np.arange(len(edges)), np.diff(offsets))
     rays1, rays2 = rays[edges[edge, 0], k1], rays[edges[edge, 1], k2]
     relative = R[edges[:, 1]] @ np.swapaxes(R[edges[:, 0]], 1, 2)
-    triplets = find_triplets(edges, offsets, k1, k2, rays1, rays2, relative)
+    triplets = find_triplets(edges, offsets, k1, k2, rays1, rays2, relative, 60)
     return EpipolarProblem(
         n,
         edges,
