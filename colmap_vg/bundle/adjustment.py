@@ -4,7 +4,9 @@ The Cauchy loss is minimised by weights that bound it from above, so each step l
 are linear, up to twice its length (Hunter & Lange, A tutorial on MM algorithms, 2004): steps are lengthened by the
 ratio of the bound's curvature to the cost's. Points are eliminated from the normal equations and refined after each
 step with the poses fixed, which keeps steps long where the points determine the poses loosely (variable projection:
-Golub & Pereyra, Inverse Problems, 2003). It ends where a step is short in the unknowns' own standard deviations.
+Golub & Pereyra, Inverse Problems, 2003). A step that fails is corrected to second order before it is damped, since the
+cost's valleys bend (Transtrum & Sethna, Improvements to the Levenberg-Marquardt algorithm, 2012). It ends where a step
+is short in the unknowns' own standard deviations.
 """
 
 from dataclasses import dataclass
@@ -100,13 +102,15 @@ def adjust(
         expected = -float(system.gradient @ step)
         short = expected <= tolerance**2 * found.variance * len(problem.free)
         step = found.relaxation * step
-        points = state.points + system.steps_of_points(problem, step, found.relaxation)
-        trial = state.moved(problem, step, points, viewed)
-        there = linearize(problem, trial, loss_scale_px)
-        for _ in range(MAX_NUM_REFINEMENTS):
-            trial, there = _with_refined_points(problem, trial, there, loss_scale_px)
-            if there.cost < found.cost or there.cost > WITHIN_REACH * found.cost:
-                break
+        shifts = system.steps_of_points(problem, step, found.relaxation)
+        trial = state.moved(problem, step, state.points + shifts, viewed)
+        at = linearize(problem, trial, loss_scale_px)
+        trial, there = _followed(problem, trial, at, loss_scale_px, found.cost)
+        if there.cost >= found.cost:
+            more, further = system.correction(problem, step, shifts, found.change_to(at), damping)
+            trial = state.moved(problem, step + more, state.points + shifts + further, viewed)
+            at = linearize(problem, trial, loss_scale_px)
+            trial, there = _followed(problem, trial, at, loss_scale_px, found.cost)
         if there.cost < found.cost:
             gain = 2.0 * (found.cost - there.cost) / max(expected, np.finfo(np.float64).tiny)
             state, found, growth = trial, there, 2.0
@@ -119,6 +123,17 @@ def adjust(
         if found is there:
             system = ReducedSystem.of(problem, pattern, state, found)
     return Adjusted(state, initial_cost, found.cost)
+
+
+def _followed(
+    problem: BundleProblem, trial: BundleState, there: Linearization, loss_scale_px: float, cost: float
+) -> tuple[BundleState, Linearization]:
+    """Let the points follow a step until it is below a cost, or too far above it."""
+    for _ in range(MAX_NUM_REFINEMENTS):
+        trial, there = _with_refined_points(problem, trial, there, loss_scale_px)
+        if there.cost < cost or there.cost > WITHIN_REACH * cost:
+            break
+    return trial, there
 
 
 def _with_refined_points(

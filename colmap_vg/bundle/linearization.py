@@ -69,6 +69,12 @@ class Linearization:
             return self.by_point
         return np.where(problem.fixed[problem.point_row], 0.0, self.by_point)
 
+    def change_to(self, other: "Linearization") -> Array:
+        """Change (2, k) of the residuals to another state, with the weights of this one; 0 where either is lost."""
+        known = (self.roots > 0.0) & (other.roots > 0.0)
+        share = np.where(known, self.roots / np.where(known, other.roots, 1.0), 0.0)
+        return np.asarray(share * other.residuals - np.where(known, self.residuals, 0.0))
+
     def where(self, observations: BoolArray, points: BoolArray, other: "Linearization") -> "Linearization":
         """Take some observations (k,) and points (q,) from another linearization with the same poses and lenses."""
         return replace(

@@ -4,7 +4,7 @@ With the Cholesky factor ``L`` of a point's own equations, an observation's deri
 and ``A`` by its point, and ``Z = F^T A L^-T``, two images share the block ``-sum Z_i Z_j^T`` over their common points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +20,7 @@ from colmap_vg.linear.solvers import factorize
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MIN_DAMPING = 1e-9
+MIN_DAMPING = 1e-11
 """Share of the diagonal that is always added, since the gauge leaves seven degrees of freedom."""
 
 
@@ -55,8 +55,10 @@ class ReducedSystem:
     gradient : (u,) array
     derivatives : (2, w, k) array
         Of the residuals by the unknowns of their images.
+    by_point : (2, 3, k) array
+        Derivatives by points.
     across : (2, 3, k) array
-        Derivatives by points times ``L^-T``.
+        Those times ``L^-T``.
     factors : PointFactors
     of_points : (3, q) array
         Gradients of points times ``L^-1``.
@@ -66,6 +68,7 @@ class ReducedSystem:
     matrix: sp.csc_array
     gradient: Array
     derivatives: Array
+    by_point: Array
     across: Array
     factors: PointFactors
     of_points: Array
@@ -85,7 +88,9 @@ class ReducedSystem:
         matrix = _assembled(problem, pattern, own, pairs)
         places, used = problem.unknowns.ravel(), problem.unknowns.ravel() >= 0
         total = np.bincount(places[used], gradient.ravel()[used], minlength=problem.num_unknowns)
-        return cls(problem.free, matrix, np.asarray(total, dtype=np.float64), derivatives, across, factors, of_points)
+        return cls(
+            problem.free, matrix, np.asarray(total, dtype=np.float64), derivatives, by_point, across, factors, of_points
+        )
 
     def step(self, damping: float) -> Array:
         """Levenberg step (u,), with damping relative to the diagonal; 0 for held poses.
@@ -111,6 +116,42 @@ class ReducedSystem:
         changes = np.einsum("awk,wk->ak", self.derivatives, np.take(padded, problem.image_row, axis=1))
         induced = gradients(self.of_points.shape[1], problem.point_row, self.across, changes)
         return -self.factors.upper(induced + relaxation * self.of_points).T
+
+    def correction(
+        self, problem: BundleProblem, step: Array, shifts: Array, change: Array, damping: float
+    ) -> tuple[Array, Array]:
+        """Add to a step what takes back the part of its change of the residuals that is not linear.
+
+        Parameters
+        ----------
+        problem : BundleProblem
+        step : (u,) array
+            Of the unknowns.
+        shifts : (q, 3) array
+            Steps of the points with it.
+        change : (2, k) array
+            Change of the residuals, with the weights of the system.
+        damping : float
+            As of the step.
+
+        Returns
+        -------
+        step : (u,) array
+        shifts : (q, 3) array
+        """
+        padded = np.append(step, 0.0)[problem.unknowns].T
+        linear = np.einsum("awk,wk->ak", self.derivatives, np.take(padded, problem.image_row, axis=1))
+        moved = np.take(np.ascontiguousarray(shifts.T), problem.point_row, axis=1)
+        bent = change - linear - np.einsum("abk,bk->ak", self.by_point, moved)
+        of_points = self.factors.lower(gradients(len(shifts), problem.point_row, self.by_point, bent))
+        left = bent - np.einsum("abk,bk->ak", self.across, np.take(of_points, problem.point_row, axis=1))
+        pulls = np.einsum("awk,ak->wk", self.derivatives, left)
+        gradient = np.zeros(len(self.gradient) + 1)
+        for row, own in zip(problem.unknowns, problem.of_images, strict=True):
+            gradient[row] += pulls[:, own].sum(axis=1)
+        further = replace(self, gradient=gradient[:-1], of_points=of_points)
+        more = further.step(damping)
+        return more, further.steps_of_points(problem, more, 1.0)
 
 
 def _by_unknowns(found: Linearization, by_lens: Array) -> Array:

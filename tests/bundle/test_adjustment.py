@@ -1,10 +1,11 @@
 """Bundle adjustment of scenes with known truth: where it ends, how it steps, and what it leaves alone."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from bundle_scenes import displaced, plain_residuals, scene
+from bundle_scenes import bent, displaced, plain_residuals, scene, street
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from colmap_vg.bundle import adjustment
@@ -140,22 +141,32 @@ def test_points_follow_a_step_that_gains_only_once_they_have(monkeypatch: pytest
 
 
 class Recorder:
-    """Keeps the dampings, steps and systems of an adjustment."""
+    """Keeps the dampings and steps of an adjustment, and the numbers of steps before each correction."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.dampings: list[float] = []
         self.steps: list[np.ndarray] = []
         self.expected: list[float] = []
-        plain = ReducedSystem.step
+        self.corrected: list[int] = []
+        plain, correction, correcting = ReducedSystem.step, ReducedSystem.correction, list[bool]()
 
         def step(system: ReducedSystem, damping: float) -> np.ndarray:
             found = plain(system, damping)
-            self.dampings.append(damping)
-            self.steps.append(found)
-            self.expected.append(-float(system.gradient @ found))
+            if not correcting:
+                self.dampings.append(damping)
+                self.steps.append(found)
+                self.expected.append(-float(system.gradient @ found))
+            return found
+
+        def corrected(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+            self.corrected.append(len(self.steps))
+            correcting.append(True)
+            found = correction(*arguments)
+            correcting.clear()
             return found
 
         monkeypatch.setattr(ReducedSystem, "step", step)
+        monkeypatch.setattr(ReducedSystem, "correction", corrected)
 
 
 def test_it_ends_with_the_first_step_that_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,7 +213,8 @@ def test_points_do_not_follow_a_step_that_is_hopeless(monkeypatch: pytest.Monkey
     told = costs_times([1.0, 1.3], monkeypatch)
     monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 1)
     adjust(problem, displaced(problem, truth, 0.01), 1.0)
-    assert len(told) == 2
+    # At the start, after the step and after its correction.
+    assert len(told) == 3
 
 
 def test_damping_grows_faster_and_faster_with_failures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,15 +224,37 @@ def test_damping_grows_faster_and_faster_with_failures(monkeypatch: pytest.Monke
     monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 5)
     adjust(problem, displaced(problem, truth, 0.01), 1.0, tolerance=1e-9)
     np.testing.assert_allclose(recorder.dampings, np.array([0.0, 1.0, 4.0, 32.0, 512.0]) * adjustment.FIRST_DAMPING)
+    assert recorder.corrected == [1, 2, 3, 4, 5]
+
+
+def test_a_step_that_fails_is_corrected_before_it_is_damped(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = scene(sigma_px=0.5)
+    costs_times([1.0, 1.3, 0.9, 0.8], monkeypatch)
+    recorder = Recorder(monkeypatch)
+    monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 2)
+    adjust(problem, displaced(problem, truth, 0.01), 1.0, tolerance=1e-9)
+    assert recorder.dampings == [0.0, 0.0]
+    assert recorder.corrected == [1]
+
+
+def test_a_bent_street_is_straight_after_two_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = street(120)
+    found = adjust(problem, bent(truth, 0.02), 1.0)
+    recorder = Recorder(monkeypatch)
+    exact = adjust(problem, found.state, 1.0, tolerance=1e-6)
+    errors, _ = align_positions(found.state.centers, exact.state.centers)
+    best, _ = align_positions(exact.state.centers, truth.centers)
+    assert errors.mean() < 0.1 * best.mean()
+    assert len(recorder.steps) < 8
 
 
 def test_damping_falls_with_the_gain_and_then_grows_slowly_again(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, truth = scene(sigma_px=0.5)
-    told = costs_times([1.0, 1.3, 1.3, 1.3, 0.999, 1.3], monkeypatch)
+    told = costs_times([1.0, *6 * [1.3], 0.999, 1.3], monkeypatch)
     recorder = Recorder(monkeypatch)
     monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 7)
     adjust(problem, displaced(problem, truth, 0.01), 1.0, tolerance=1e-9)
-    gain = 2.0 * (told[0] - told[4]) / recorder.expected[3]
+    gain = 2.0 * (told[0] - told[7]) / recorder.expected[3]
     assert 0.0 < gain < 0.1
     after = recorder.dampings[3] * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
     np.testing.assert_allclose(recorder.dampings[4:], after * np.array([1.0, 2.0, 8.0]))

@@ -68,6 +68,41 @@ def test_a_step_is_that_of_the_whole_dense_problem(num_lenses: int, free: tuple[
     np.testing.assert_allclose(moved, expected, atol=1e-8)
 
 
+def test_a_correction_is_that_of_the_whole_dense_problem() -> None:
+    problem, truth = scene(num_points=25, num_lenses=2, sigma_px=0.5, seen=0.9)
+    state, scale, damping = displaced(problem, truth, 1e-3), 2.0, 0.01
+    J, _ = jacobian(problem, state, scale)
+    H, u = J.T @ J, problem.num_unknowns
+    rng = np.random.default_rng(0)
+    step, shifts, bend = rng.normal(size=u), rng.normal(size=state.points.shape), rng.normal(size=len(J))
+    change = bend + J @ np.concatenate([step, shifts.ravel()])
+    reduced = H[:u, :u] - H[:u, u:] @ np.linalg.solve(H[u:, u:], H[u:, :u])
+    level = np.zeros(len(H))
+    level[:u] = (damping + MIN_DAMPING) * np.diag(reduced)
+    expected = -np.linalg.solve(H + np.diag(level), J.T @ bend)
+    system = ReducedSystem.of(problem, ReducedPattern(problem), state, linearize(problem, state, scale))
+    more, further = system.correction(problem, step, shifts, change.reshape(-1, 2).T, damping)
+    size = np.sqrt(np.diag(H))
+    found = np.concatenate([more, further.ravel()])
+    np.testing.assert_allclose(found * size, expected * size, atol=1e-4 * np.abs(expected * size).max())
+
+
+def test_changes_of_residuals_have_the_weights_of_where_they_start() -> None:
+    problem, truth = scene(seen=1.0, sigma_px=0.5)
+    one = linearize(problem, displaced(problem, truth, 1e-3), 1.0)
+    moved = displaced(problem, truth, 2e-3)
+    points = moved.points.copy()
+    points[0] = moved.centers[0] - 3.0 * moved.rotations[0, 2]  # behind the first camera
+    moved = replace(moved, points=points)
+    change = one.change_to(linearize(problem, moved, 1.0))
+    expected = one.roots * plain_residuals(problem, moved).reshape(-1, 2).T - one.residuals
+    lost = np.isnan(expected).any(axis=0)
+    assert lost[(problem.point_row == 0) & (problem.image_row == 0)].all()
+    assert lost.mean() < 0.1
+    np.testing.assert_allclose(change[:, ~lost], expected[:, ~lost], atol=1e-9)
+    assert not change[:, lost].any()
+
+
 def test_two_observations_of_a_point_in_one_image_count_twice() -> None:
     problem, truth = scene(num_points=20, num_lenses=1, sigma_px=0.5, seen=0.95)
     order = np.sort(np.concatenate([np.arange(len(problem.image_row)), [0, 3, 17]]), kind="stable")

@@ -58,6 +58,37 @@ def scene(
     return problem, BundleState(R, centers, points, parameters)
 
 
+def street(num_images: int, *, sigma_px: float = 0.3, seed: int = 0) -> tuple[BundleProblem, BundleState]:
+    """Images along a façade, each of which sees what is within two steps of it."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-2.0, -1.0, 3.0], [num_images + 1.0, 1.0, 4.0], (8 * num_images, 3))
+    centers = np.stack([np.arange(num_images), *np.zeros((2, num_images))], axis=1).astype(np.float64)
+    rotations = np.tile(np.eye(3), (num_images, 1, 1))
+    image_row, point_row = np.nonzero(np.abs(points[:, 0] - centers[:, :1]) < 2.0)
+    lens = Pinhole(np.zeros(0, dtype=np.int64))
+    parameters = np.array([FOCAL, 500.0, 400.0, 0.0])
+    keypoints = lens.project(parameters, points[point_row] - centers[image_row])
+    keypoints += sigma_px * rng.normal(size=keypoints.shape)
+    problem = BundleProblem(image_row, point_row, keypoints, np.zeros(num_images, dtype=np.int64), [lens])
+    return problem, BundleState(rotations, centers, points, [parameters])
+
+
+def bent(state: BundleState, angle: float) -> BundleState:
+    """A street bent to an arc, whose ends point an angle, radians, from its middle; what images see stays nearly."""
+    length = float(np.ptp(state.centers[:, 0])) / 2.0
+    middle = float(state.centers[:, 0].mean())
+
+    def moved(positions: np.ndarray) -> np.ndarray:
+        turn = angle * (positions[:, 0] - middle) / length
+        radius = length / angle
+        depth = radius - positions[:, 2]
+        return np.stack([middle + depth * np.sin(turn), positions[:, 1], radius - depth * np.cos(turn)], axis=1)
+
+    turns = angle * (state.centers[:, 0] - middle) / length
+    R = Rotation.from_euler("y", turns[:, None]).as_matrix()
+    return BundleState(R, moved(state.centers), moved(state.points), state.parameters)
+
+
 def displaced(problem: BundleProblem, state: BundleState, size: float, seed: int = 1) -> BundleState:
     """A state some way off, with focal lengths and radial terms too."""
     rng = np.random.default_rng(seed)
