@@ -284,13 +284,10 @@ def _remove_unsupported(mapper: "pycolmap.IncrementalMapper", kept_frames: froze
     while True:
         frames = {i: reconstruction.image(i).frame_id for i in sorted(reconstruction.reg_image_ids())}
         support: Counter[int] = Counter()
-        for image_id, count in supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG).items():
+        counts = supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG, without_frames=kept_frames)
+        for image_id, count in counts.items():
             support[frames[image_id]] += count
-        weak = [
-            (count, frame_id)
-            for frame_id, count in support.items()
-            if count < MIN_SUPPORTED_OBSERVATIONS and frame_id not in kept_frames
-        ]
+        weak = [(count, frame_id) for frame_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]
         if not weak:
             return removed
         _, frame_id = min(weak)

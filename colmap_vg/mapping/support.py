@@ -13,6 +13,7 @@ def supported_observations(
     reconstruction: "pycolmap.Reconstruction",
     min_angle_deg: float,
     min_track_length: int = 3,
+    without_frames: frozenset[int] = frozenset(),
 ) -> dict[int, int]:
     """Count each registered image's observations of well-triangulated points.
 
@@ -23,28 +24,32 @@ def supported_observations(
         Minimum triangulation angle of a point, degrees.
     min_track_length : int
         Minimum number of views of a point.
+    without_frames : frozenset of int
+        Ids of frames whose images are not asked for.
 
     Returns
     -------
     dict of image id to int
     """
-    registered = sorted(reconstruction.reg_image_ids())
+    registered = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
+    asked = np.array([reconstruction.image(i).frame_id not in without_frames for i in registered.tolist()], dtype=bool)
     seen = ModelObservations.of(reconstruction)
     image_row = np.searchsorted(registered, seen.image_ids)
-    _, row, length = np.unique(seen.point_ids, return_inverse=True, return_counts=True)
+    every, row, length = np.unique(seen.point_ids, return_inverse=True, return_counts=True)
+    long = (length >= min_track_length) & (np.bincount(row, asked[image_row], len(every)) > 0.0)
     by_point = np.argsort(row, kind="stable")
-    by_point = by_point[length[row[by_point]] >= min_track_length]
+    by_point = by_point[long[row[by_point]]]
     image_row = image_row[by_point]
-    long, point_row = np.unique(seen.point_ids[by_point], return_inverse=True)
-    if len(long) == 0:
-        return dict.fromkeys(registered, 0)
-    centers = np.array([reconstruction.image(i).projection_center() for i in registered])
-    rays = centers[image_row] - seen.positions_of(long)[point_row]
+    point_row = (np.cumsum(long) - 1)[row[by_point]]
+    if not long.any():
+        return dict.fromkeys(registered[asked].tolist(), 0)
+    centers = np.array([reconstruction.image(i).projection_center() for i in registered.tolist()])
+    rays = centers[image_row] - seen.positions_of(every[long])[point_row]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    offsets = np.searchsorted(point_row, np.arange(len(long) + 1))
+    offsets = np.searchsorted(point_row, np.arange(long.sum() + 1))
     wide = _widest_angles(rays, offsets) >= np.radians(min_angle_deg)
     counts = np.bincount(image_row[wide[point_row]], minlength=len(registered))
-    return dict(zip(registered, counts.tolist(), strict=True))
+    return dict(zip(registered[asked].tolist(), counts[asked].tolist(), strict=True))
 
 
 def _widest_angles(rays: Array, offsets: NDArray[np.int64]) -> Array:
@@ -56,7 +61,7 @@ def _widest_angles(rays: Array, offsets: NDArray[np.int64]) -> Array:
     reference = rays[offsets[:-1]]
     for _ in range(2):
         cosine = np.einsum("ka,ka->k", rays, reference[point])
-        order = np.lexsort((cosine, point))
-        farthest = order[offsets[:-1]]
-        reference = rays[farthest]
-    return np.asarray(np.arccos(np.clip(cosine[farthest], -1.0, 1.0)))
+        least = np.minimum.reduceat(cosine, offsets[:-1])
+        candidates = np.flatnonzero(cosine == least[point])
+        reference = rays[candidates[np.searchsorted(point[candidates], np.arange(len(least)))]]
+    return np.asarray(np.arccos(np.clip(least, -1.0, 1.0)))

@@ -47,6 +47,15 @@ def test_counts_are_those_of_all_pairs_of_rays(track_length: int, min_angle_deg:
     assert supported_observations(model, min_angle_deg, 2) == brute_force(model, min_angle_deg, 2)
 
 
+def test_images_of_some_frames_alone_are_counted() -> None:
+    model = make_model(9, 80, 4, seed=3)
+    frames = frozenset(model.image(i).frame_id for i in (2, 3, 7))
+    expected = {i: count for i, count in brute_force(model, 1.5, 3).items() if i not in (2, 3, 7)}
+    assert supported_observations(model, 1.5, without_frames=frames) == expected
+    every = frozenset(model.reg_frame_ids())
+    assert supported_observations(model, 1.5, without_frames=every) == {}
+
+
 def test_a_far_point_does_not_count() -> None:
     model = make_model(4, 30, -1, seed=1)
     before = supported_observations(model, 1.5)
