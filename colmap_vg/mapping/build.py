@@ -177,20 +177,18 @@ def finish_registration(
 def _adjust_to_convergence(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, held: Held) -> bool:
     """Alternate bundle adjustment and retriangulation; return whether they converged in `MAX_NUM_ROUNDS` rounds."""
     triangulator = triangulator_options(options)
-    lenses = _focal_lengths(mapper.reconstruction)
     _adjust(mapper, options, held, rough=True)
-    cost_ratio = 0.0
     for _ in range(MAX_NUM_ROUNDS):
-        before, lenses = lenses, _focal_lengths(mapper.reconstruction)
         report_progress("tracks")
         mapper.complete_and_merge_tracks(triangulator)
         report_progress("tracks")
         mapper.retriangulate(triangulator)
         _filter(mapper)
-        settled = np.abs(lenses / before - 1.0).max(initial=0.0) <= CONVERGED_FOCAL_CHANGE
-        if cost_ratio >= CONVERGED_COST_RATIO and settled:
-            return True
+        before = _focal_lengths(mapper.reconstruction)
         cost_ratio = _adjust(mapper, options, held)
+        change = np.abs(_focal_lengths(mapper.reconstruction) / before - 1.0).max(initial=0.0)
+        if cost_ratio >= CONVERGED_COST_RATIO and change <= CONVERGED_FOCAL_CHANGE:
+            return True
     return False
 
 
