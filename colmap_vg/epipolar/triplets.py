@@ -120,16 +120,16 @@ def find_triplets(
     shared = np.concatenate([[0], np.cumsum(np.bincount(first[0], minlength=len(pairs)))]).astype(np.int64)
     report_progress("tracks")
     kept = evenly_thinned(shared, max_num_tracks)
-    of_other, of_middle = np.concatenate([bearings2, bearings1]), np.concatenate([bearings1, bearings2])
-    in_other = np.concatenate([keypoints2, keypoints1]).astype(np.int64)
     report_progress("tracks")
     rows_a, rows_c = first[1][kept], second[kept]
+    # The row of a match in the lists of both directions, and that of its other end.
+    ends = [(rows_a + k) % (2 * k), rows_a, (rows_c + k) % (2 * k)]
     return Triplets(
         np.stack([other[pairs[:, 0]], middle[pairs[:, 0]], other[pairs[:, 1]]], axis=1),
         pairs % m,
         segment_subset(shared, kept),
-        np.stack([of_other[rows_a].T, of_middle[rows_a].T, of_other[rows_c].T]),
-        np.stack([in_other[rows_a], keypoints[rows_a], in_other[rows_c]]),
+        np.stack([np.where(rows < k, bearings1[rows % k].T, bearings2[rows % k].T) for rows in ends]),
+        np.stack([keypoints[rows] for rows in ends]),
     )
 
 

@@ -117,7 +117,7 @@ def _explained(tables: DatabaseTables, pixels: tuple[Array, ...]) -> BoolArray:
     every = np.arange(len(tables.pairs))
     thin = evenly_thinned(tables.offsets, MAX_MATCHES_CHECKED)
     offsets, rows = segment_subset(tables.offsets, thin), np.flatnonzero(thin)
-    first, second = (tables.matched_keypoints(rows, every, offsets, side) for side in (0, 1))
+    ends = np.stack([tables.matched_keypoints(rows, every, offsets, side) for side in (0, 1)])
     K = np.linalg.inv(np.array([calibration_matrix(c) for c in tables.cameras]).reshape(-1, 3, 3))
     camera1, camera2 = tables.camera_idx[tables.pairs].T
     of_pose = so3.hat(np.nan_to_num(tables.translations)) @ tables.rotations
@@ -127,8 +127,11 @@ def _explained(tables: DatabaseTables, pixels: tuple[Array, ...]) -> BoolArray:
         epipolar = ((matrix, pixel_sampson_errors) for matrix in (tables.F, of_E, of_pose))
         for matrix, distance in (*epipolar, (tables.H, transfers)):
             report_progress("verification")
-            far = np.abs(distance(matrix, offsets, points[first], points[second]))
-            explained |= segment_quantiles(offsets, np.nan_to_num(far, nan=FAR, posinf=FAR)) <= MAX_ERROR_PX
+            left = np.flatnonzero(~explained)
+            matches, parts = rows_of_segments(offsets, left)
+            first, second = ends[:, matches]
+            far = np.abs(distance(matrix[left], parts, points[first], points[second]))
+            explained[left] = segment_quantiles(parts, np.nan_to_num(far, nan=FAR, posinf=FAR)) <= MAX_ERROR_PX
     return explained
 
 

@@ -76,8 +76,11 @@ def evenly_thinned(offsets: IntArray, limit: int) -> NDArray[np.bool_]:
     counts = np.diff(offsets)
     if limit == 0 or (counts <= limit).all():
         return np.ones(int(offsets[-1]), dtype=bool)
-    segment = segment_of_rows(offsets)
-    rank = np.arange(len(segment)) - offsets[:-1][segment]
-    kept = np.minimum(counts, limit)[segment]
-    # Keep row r of c where floor(r kept / c) increases: exactly `kept` rows.
-    return np.asarray((rank * kept) // counts[segment] != ((rank - 1) * kept) // counts[segment])
+    kept = np.minimum(counts, limit)
+    chosen = np.concatenate([[0], np.cumsum(kept)]).astype(np.int64)
+    segment = segment_of_rows(chosen)
+    rank = np.arange(len(segment)) - chosen[:-1][segment]
+    mask = np.zeros(int(offsets[-1]), dtype=bool)
+    # The rows r of c where floor(r kept / c) increases.
+    mask[offsets[:-1][segment] - (-rank * counts[segment]) // kept[segment]] = True
+    return mask
