@@ -177,12 +177,11 @@ def _blocks(
     """Blocks of images (n, w, w) and of pairs (m, w, w), and gradients (n, w)."""
     _, width, count = derivatives.shape
     eliminated = np.empty((count, 3, width))
-    for axis in range(3):
-        for unknown in range(width):
-            eliminated[:, axis, unknown] = np.einsum("ak,ak->k", derivatives[:, unknown], across[:, axis])
     own, gradient = np.empty((problem.num_images, width, width)), np.empty((problem.num_images, width))
     for image, at in enumerate(problem.of_images):
-        F, Z = derivatives[:, :, at].transpose(2, 0, 1).reshape(-1, width), eliminated[at].reshape(-1, width)
+        D, A = derivatives[:, :, at], across[:, :, at]
+        eliminated[at] = (D[0] * A[0][:, None] + D[1] * A[1][:, None]).transpose(2, 0, 1)
+        F, Z = D.transpose(2, 0, 1).reshape(-1, width), eliminated[at].reshape(-1, width)
         own[image] = F.T @ F - Z.T @ Z
         point_gradients = np.take(of_points, problem.point_row[at], axis=1).T.ravel()
         gradient[image] = F.T @ residuals[:, at].T.ravel() - Z.T @ point_gradients

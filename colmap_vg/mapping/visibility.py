@@ -59,7 +59,8 @@ def sampled_tracks(
     # Each image once, even if it sees a point at two keypoints.
     seen = ModelObservations.of(reconstruction)
     image_row = np.searchsorted(image_ids, seen.image_ids)
-    observed, image_row = np.divmod(np.unique(seen.point_ids * n + image_row), n)
+    sights = np.sort(seen.point_ids * n + image_row)
+    observed, image_row = np.divmod(sights[np.diff(sights, prepend=-1) > 0], n)
     point_ids, point_row, length = np.unique(observed, return_inverse=True, return_counts=True)
     by_length = np.argsort(length, kind="stable")
     by_length = by_length[length[by_length] >= MIN_TRACK_LENGTH]
