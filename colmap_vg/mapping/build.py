@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_vg.colmap_io.cameras import focal_length
 from colmap_vg.events import StageLog, report_progress
 from colmap_vg.mapping.bundle import Held, adjust_bundle, held_of
-from colmap_vg.mapping.lenses import bend_undistorted_fov, reset_diverged_lenses
+from colmap_vg.mapping.lenses import bend_undistorted_fov, reset_diverged_lenses, warn_of_stretched
 from colmap_vg.mapping.options import (
     MAX_REPROJECTION_PX,
     MIN_TRIANGULATION_ANGLE_DEG,
@@ -108,6 +108,7 @@ def build_model(
             lambda changed: _adjust(mapper, changed, held),
         )
         _warn_of_unrefined(reconstruction, cache, options, named, log)
+        warn_of_stretched(reconstruction, cache, log)
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()

@@ -1,4 +1,4 @@
-"""Reset distortion coefficients that the images do not determine and that diverged in bundle adjustment."""
+"""Reset distortion coefficients that the images do not determine, and warn of lenses that are hardly real."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,6 +16,10 @@ START_FOV_ANGLE = 0.3
 """Parameter of FOV cameras without distortion at the start of bundle adjustment, radians: 1 % at 30 degrees."""
 MAX_ASPECT = 1.01
 """Maximum ratio of the focal lengths in x and y for a camera model with a single one."""
+
+MAX_STRETCH = 1.1
+"""Maximum factor by which bundle adjustment changes the ratio of the focal lengths in x and y without a warning: pixels
+are square, or as the calibration has them, to a per cent."""
 
 _SIMPLER: dict[str, tuple[str, tuple[tuple[int, ...], ...]]] = {
     "FULL_OPENCV": ("OPENCV", ((0,), (1,), (2,), (3,), (4,), (5,), (6,), (7,))),
@@ -85,6 +89,40 @@ def reset_diverged_lenses(
         adjust(replace(options, ba_refine_extra_params=False))
     _warn_of_diverged(reconstruction, log)
     return frozenset(diverged)
+
+
+def warn_of_stretched(
+    reconstruction: "pycolmap.Reconstruction", cache: "pycolmap.DatabaseCache", log: StageLog
+) -> None:
+    """Warn of cameras whose focal lengths in x and y bundle adjustment moved apart: the model may be stretched, too.
+
+    On a turntable the keypoints tell one of them only loosely, and errors that are no noise decide it.
+
+    Parameters
+    ----------
+    reconstruction : pycolmap.Reconstruction
+        Adjusted.
+    cache : pycolmap.DatabaseCache
+        With the initial cameras.
+    log : StageLog
+    """
+    used = sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()})
+    pairs = {i: [_aspect(lenses.camera(i)) for lenses in (cache, reconstruction)] for i in used}
+    stretched = {i: pair for i, pair in pairs.items() if max(pair) > MAX_STRETCH * min(pair)}
+    if stretched:
+        camera_id, (before, after) = next(iter(stretched.items()))
+        log.warn(
+            f"Bundle adjustment changed the ratio of the focal lengths in x and y of {len(stretched)} cameras (first:"
+            f" {camera_id}, from {before:.3g} to {after:.3g}): the images determine it only loosely, and the model may"
+            " be stretched. Choose a camera model with one focal length, as SIMPLE_RADIAL, or keep the focal lengths"
+            " (ba_refine_focal_length)."
+        )
+
+
+def _aspect(lens: "pycolmap.Camera") -> float:
+    """Focal length in x over that in y; 1 with a single one."""
+    focal = [float(lens.params[k]) for k in lens.focal_length_idxs()]
+    return focal[0] / focal[1] if len(focal) == 2 and focal[1] > 0.0 else 1.0
 
 
 def _warn_of_diverged(reconstruction: "pycolmap.Reconstruction", log: StageLog) -> None:
