@@ -18,11 +18,9 @@ from colmap_vg.positions.result import centered, spread, unit_weights
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-LUD_ITERATIONS = 10
-"""Reweighting iterations of LUD; two or four times as many change no verdict (rings of 50 to 1,000 cameras, 20-40 %
-outliers)."""
-MAX_NEWTON_STEPS = 4
-"""Maximum number of Newton steps between them."""
+LUD_ITERATIONS = 15
+"""Reweighting iterations of LUD, with a Newton step each: on rings, grids, lines and random graphs of 50 to 600 cameras
+with 10 to 40 % outliers as many verdicts are right as with four steps each, which take half as long again."""
 SCALES_DEG = (20.0, 14.0, 10.0, 7.0, 5.0)
 """Successive Geman-McClure scales, degrees; the last is COLMAP's default for rotations."""
 ITERATIONS_PER_SCALE = 6
@@ -62,7 +60,7 @@ def robust_direction_residuals(
         directions_world,
         w,
         max_num_iterations=LUD_ITERATIONS,
-        max_inner_iterations=MAX_NEWTON_STEPS,
+        max_inner_iterations=1,
     ).projection_centers
     size = spread(p)
     system = LaplacianSystem(num_images, edges)
