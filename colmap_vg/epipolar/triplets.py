@@ -15,7 +15,14 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from colmap_vg.events import report_progress
 from colmap_vg.two_view.pieces import Pieces
-from colmap_vg.two_view.segments import evenly_thinned, rows_of_segments, segment_of_rows, segment_subset, segment_sums
+from colmap_vg.two_view.segments import (
+    evenly_thinned,
+    products_of_segments,
+    rows_of_segments,
+    segment_of_rows,
+    segment_subset,
+    segment_sums,
+)
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -105,7 +112,7 @@ def find_triplets(
         About `TRIPLETS_PER_IMAGE` per middle image.
     """
     m, k = len(edges), len(bearings1)
-    turned = np.einsum("kab,kb->ka", relative_rotations[segment_of_rows(offsets)], bearings1)
+    turned = products_of_segments(relative_rotations, offsets, bearings1)
     sine = np.linalg.norm(np.cross(turned, bearings2), axis=1)
     # Half-edges at the first images, then those at the second ones; rows of matches in the same order.
     report_progress("tracks")

@@ -21,8 +21,8 @@ from colmap_vg.two_view.eight_point import estimate_fundamental_from_inliers
 from colmap_vg.two_view.sampson_errors import pixel_sampson_errors
 from colmap_vg.two_view.segments import (
     evenly_thinned,
+    products_of_segments,
     rows_of_segments,
-    segment_of_rows,
     segment_quantiles,
     segment_subset,
     segment_sums,
@@ -138,7 +138,7 @@ def _explained(tables: DatabaseTables, pixels: tuple[Array, ...]) -> BoolArray:
 def transfers(H: Array, offsets: IntArray, points1: Array, points2: Array) -> Array:
     """Transfer errors (k,) of matches under homographies, in the second image, pixels."""
     x1 = np.concatenate([points1, np.ones((len(points1), 1))], axis=1)
-    moved = np.einsum("kab,kb->ka", H[segment_of_rows(offsets)], x1)
+    moved = products_of_segments(H, offsets, x1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.linalg.norm(moved[:, :2] / moved[:, 2:] - points2, axis=1))
 

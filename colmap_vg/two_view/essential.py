@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import angle_between
-from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_subset, segment_sums
+from colmap_vg.two_view.segments import (
+    products_of_segments,
+    segment_of_rows,
+    segment_quantiles,
+    segment_subset,
+    segment_sums,
+)
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -94,7 +100,7 @@ def in_front_of_both(
     ``a = R x1``, ``b = x2``, ``c = a.b``.
     """
     edge = segment_of_rows(offsets)
-    a = np.einsum("kij,kj->ki", rotations[edge], bearings1)
+    a = products_of_segments(rotations, offsets, bearings1)
     t = -np.einsum("mij,mj->mi", rotations, directions)[edge]
     along1, along2 = np.einsum("ki,ki->k", a, t), np.einsum("ki,ki->k", bearings2, t)
     cosine = np.einsum("ki,ki->k", a, bearings2)
@@ -105,11 +111,11 @@ def check_cheirality(
     rotations: Array, directions: Array, offsets: IntArray, bearings1: Array, bearings2: Array
 ) -> RelativePoses:
     """Count the matches in front of both cameras, and their triangulation angles, for poses (m, 3, 3), (m, 3)."""
-    edge = segment_of_rows(offsets)
     front = in_front_of_both(rotations, directions, offsets, bearings1, bearings2)
     num = segment_sums(offsets, front.astype(np.float64)).astype(np.int64)
-    turned = np.einsum("kij,kj->ki", rotations[edge[front]], bearings1[front])
-    angles = segment_quantiles(segment_subset(offsets, front), angle_between(turned, bearings2[front]))
+    of_front = segment_subset(offsets, front)
+    turned = products_of_segments(rotations, of_front, bearings1[front])
+    angles = segment_quantiles(of_front, angle_between(turned, bearings2[front]))
     share = num / np.maximum(np.diff(offsets), 1)
     return RelativePoses(rotations, directions, num, share, np.where(num > 0, np.nan_to_num(angles), 0.0))
 

@@ -14,7 +14,7 @@ from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import angle_between, normalized
 from colmap_vg.two_view.essential import RelativePoses, check_cheirality, essential_from_pose
 from colmap_vg.two_view.sampson_errors import sampson_errors
-from colmap_vg.two_view.segments import segment_of_rows, segment_quantiles, segment_sums
+from colmap_vg.two_view.segments import products_of_segments, segment_quantiles, segment_sums
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -135,12 +135,11 @@ def pure_rotations(
     -------
     PureRotations
     """
-    edge = segment_of_rows(offsets)
     products = bearings2[:, :, None] * bearings1[:, None, :]
     weights = np.ones(len(bearings1))
     for _ in range(num_iterations):
         rotations = so3.project(segment_sums(offsets, products, weights))
-        angles = angle_between(np.einsum("kij,kj->ki", rotations[edge], bearings1), bearings2)
+        angles = angle_between(products_of_segments(rotations, offsets, bearings1), bearings2)
         weights = 1.0 / (1.0 + np.square(angles / scale))
     return PureRotations(rotations, segment_quantiles(offsets, angles))
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_vg.two_view.pieces import Pieces
-from colmap_vg.two_view.segments import segment_of_rows
+from colmap_vg.two_view.segments import products_of_segments, segment_of_rows
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -53,9 +53,8 @@ def sampson_errors(
         Radians, or pixels if focal lengths are given. Zero for a match at both epipoles.
     """
     edge = segment_of_rows(offsets)
-    row_E = E[edge]
-    line2 = np.einsum("kij,kj->ki", row_E, bearings1)
-    line1 = np.einsum("kij,ki->kj", row_E, bearings2)
+    line2 = products_of_segments(E, offsets, bearings1)
+    line1 = products_of_segments(np.swapaxes(E, 1, 2), offsets, bearings2)
     algebraic = np.einsum("ki,ki->k", bearings2, line2)
     squared = np.square(algebraic)
     variance1 = np.einsum("ki,ki->k", line1, line1) - squared
@@ -86,9 +85,9 @@ def pixel_sampson_errors(F: Array, offsets: IntArray, points1: Array, points2: A
     (k,) array
         Pixels. Not finite for a match at both epipoles.
     """
-    F = F[segment_of_rows(offsets)]
     x1, x2 = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (points1, points2))
-    line2, line1 = np.einsum("kab,kb->ka", F, x1), np.einsum("kab,ka->kb", F, x2)
+    line2 = products_of_segments(F, offsets, x1)
+    line1 = products_of_segments(np.swapaxes(F, 1, 2), offsets, x2)
     length = np.sqrt((line2[:, :2] ** 2).sum(axis=1) + (line1[:, :2] ** 2).sum(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.einsum("ka,ka->k", x2, line2) / length)

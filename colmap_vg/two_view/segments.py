@@ -1,4 +1,4 @@
-"""Sums and medians over the segments of a concatenated array, without a loop over segments.
+"""Sums, medians and products over the segments of a concatenated array, without a loop over segments.
 
 Segment k is rows ``offsets[k]:offsets[k + 1]``; segments may be empty.
 """
@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+SEGMENTS_AT_A_TIME = 128
+"""Segments whose rows are multiplied together."""
 
 
 def segment_of_rows(offsets: IntArray) -> IntArray:
@@ -62,6 +65,19 @@ def segment_quantiles(offsets: IntArray, values: Array, quantile: float = 0.5) -
 def segment_subset(offsets: IntArray, keep: NDArray[np.bool_]) -> IntArray:
     """Offsets (m + 1,) of the segments after only the rows of a mask (k,) are kept."""
     return np.concatenate([[0], np.cumsum(keep)])[offsets].astype(np.int64)
+
+
+def products_of_segments(matrices: Array, offsets: IntArray, vectors: Array) -> Array:
+    """Multiply the vectors (k, b) of each segment by its matrix (m, a, b): (k, a).
+
+    Some segments at a time, so that their matrices, repeated for each vector, stay in the processor's memory.
+    """
+    found = np.empty((len(vectors), matrices.shape[1]))
+    for start in range(0, len(matrices), SEGMENTS_AT_A_TIME):
+        bounds = offsets[start : start + SEGMENTS_AT_A_TIME + 1]
+        rows, segment = slice(bounds[0], bounds[-1]), segment_of_rows(bounds - bounds[0])
+        found[rows] = np.einsum("kab,kb->ka", matrices[start + segment], vectors[rows])
+    return found
 
 
 def rows_of_segments(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, IntArray]:

@@ -3,9 +3,11 @@
 import itertools
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from colmap_vg.two_view import segments
 from colmap_vg.two_view.segments import rows_of_segments, segment_quantiles, segment_subset, segment_sums
 
 COUNTS = st.lists(st.integers(0, 6), min_size=1, max_size=8)
@@ -28,3 +30,16 @@ def test_segments_are_what_loops_give(counts, quantile, seed):
     rows, subset = rows_of_segments(offsets, chosen)
     np.testing.assert_array_equal(rows, np.concatenate([np.arange(offsets[-1])[parts[k]] for k in chosen] or [[]]))
     np.testing.assert_array_equal(np.diff(subset), np.diff(offsets)[chosen])
+
+
+@pytest.mark.parametrize("at_a_time", [1, 3, 128])
+def test_products_are_those_of_each_segment(at_a_time: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segments, "SEGMENTS_AT_A_TIME", at_a_time)
+    rng = np.random.default_rng(0)
+    counts = np.array([0, 3, 1, 0, 0, 7, 2, 0])
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    matrices, vectors = rng.normal(size=(8, 2, 3)), rng.normal(size=(13, 3))
+    found = segments.products_of_segments(matrices, offsets, vectors)
+    expected = [matrices[k] @ vectors[row] for k in range(8) for row in range(offsets[k], offsets[k + 1])]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert segments.products_of_segments(matrices[:0], np.zeros(1, dtype=np.int64), vectors[:0]).shape == (0, 2)
