@@ -2,11 +2,11 @@
 
 The Cauchy loss is minimised by weights that bound it from above, so each step lowers the cost as far as the residuals
 are linear, up to twice its length (Hunter & Lange, A tutorial on MM algorithms, 2004): steps are lengthened by the
-ratio of the bound's curvature to the cost's. Points are eliminated from the normal equations and refined after each
-step with the poses fixed, which keeps steps long where the points determine the poses loosely (variable projection:
-Golub & Pereyra, Inverse Problems, 2003). A step that fails is corrected to second order before it is damped, since the
-cost's valleys bend (Transtrum & Sethna, Improvements to the Levenberg-Marquardt algorithm, 2012). It ends where a step
-is short in the unknowns' own standard deviations.
+ratio of the bound's curvature to the cost's, and where they go on in one direction. Points are eliminated from the
+normal equations and refined after each step with the poses fixed, which keeps steps long where the points determine the
+poses loosely (variable projection: Golub & Pereyra, Inverse Problems, 2003). A step that fails is corrected to second
+order before it is damped, since the cost's valleys bend (Transtrum & Sethna, Improvements to the Levenberg-Marquardt
+algorithm, 2012). It ends where a step is short in the unknowns' own standard deviations.
 """
 
 from dataclasses import dataclass
@@ -35,6 +35,9 @@ MAX_NUM_REFINEMENTS = 3
 narrow and bent, as that of a turntable's focal length, the points need more to follow a long step along it."""
 WITHIN_REACH = 1.2
 """Cost after a step, over that before, above which points are not expected to make up for it."""
+MIN_SHARE, MAX_SHARE = 0.3, 0.7
+"""Share of a step in the one before, in the metric of their system, above which the next ones are expected to go on as
+a geometric series, and the largest share that is believed: weights that change with residuals slow some directions."""
 FIRST_DAMPING, MAX_DAMPING = 1e-8, 1e4
 """Damping after the first step that fails, and damping at which no step helps."""
 
@@ -90,6 +93,7 @@ def adjust(
     if not len(problem.free):
         return Adjusted(state, initial_cost, found.cost)
     system = ReducedSystem.of(problem, pattern, state, found)
+    before: Array | None = None
     for count in range(MAX_NUM_STEPS):
         report_progress(f"bundle adjustment, step {count + 1}")
         try:
@@ -101,7 +105,9 @@ def adjust(
             continue
         expected = -float(system.gradient @ step)
         short = expected <= tolerance**2 * found.variance * len(problem.free)
-        step = found.relaxation * step
+        longer = _lengthening(system, before, step)
+        before = step if longer == 1.0 else None
+        step = longer * found.relaxation * step
         shifts = system.steps_of_points(problem, step, found.relaxation)
         trial = state.moved(problem, step, state.points + shifts, viewed)
         at = linearize(problem, trial, loss_scale_px)
@@ -123,6 +129,15 @@ def adjust(
         if found is there:
             system = ReducedSystem.of(problem, pattern, state, found)
     return Adjusted(state, initial_cost, found.cost)
+
+
+def _lengthening(system: ReducedSystem, before: Array | None, step: Array) -> float:
+    """Factor of a step that goes on in the direction of the one before: the sum of the geometric series of both."""
+    if before is None:
+        return 1.0
+    along = system.matrix @ before
+    share = float(step @ along) / max(float(before @ along), np.finfo(np.float64).tiny)
+    return 1.0 / (1.0 - min(share, MAX_SHARE)) if share > MIN_SHARE else 1.0
 
 
 def _followed(

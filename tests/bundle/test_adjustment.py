@@ -9,7 +9,7 @@ from bundle_scenes import bent, displaced, plain_residuals, scene, street
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from colmap_vg.bundle import adjustment
-from colmap_vg.bundle.adjustment import adjust
+from colmap_vg.bundle.adjustment import MAX_SHARE, adjust
 from colmap_vg.bundle.linearization import (
     Linearization,
     linearize,
@@ -303,3 +303,43 @@ def test_blas_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     with threadpool_limits(2, "blas"):
         adjust(problem, displaced(problem, truth, 0.01), 1.0)
     assert threads == {1}
+
+
+def test_a_step_that_goes_on_in_the_direction_of_the_last_one_is_lengthened() -> None:
+    problem, truth = scene(sigma_px=0.5)
+    state = displaced(problem, truth, 0.01)
+    system = ReducedSystem.of(problem, ReducedPattern(problem), state, linearize(problem, state, 1.0))
+    before = system.step(0.0)
+    across = np.random.default_rng(0).normal(size=len(before)) * np.abs(before)
+    across -= before * (across @ system.matrix @ before) / (before @ system.matrix @ before)
+    for share, factor in ((0.0, 1.0), (0.25, 1.0), (0.5, 2.0), (0.6, 2.5), (0.9, 1.0 / (1.0 - MAX_SHARE)), (-0.5, 1.0)):
+        assert adjustment._lengthening(system, before, share * before + across) == pytest.approx(factor)
+    assert adjustment._lengthening(system, None, before) == 1.0
+
+
+def test_the_step_after_a_lengthened_one_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = scene(sigma_px=0.5)
+    asked: list[bool] = []
+
+    def always_longer(system: ReducedSystem, before: np.ndarray | None, step: np.ndarray) -> float:
+        asked.append(before is not None)
+        return 1.5 if before is not None else 1.0
+
+    monkeypatch.setattr(adjustment, "_lengthening", always_longer)
+    monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 5)
+    adjust(problem, displaced(problem, truth, 0.01), 1.0, tolerance=1e-9)
+    assert asked == [False, True, False, True, False]
+
+
+def test_heavy_tails_take_fewer_steps_than_without_lengthening(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = scene(12, 300, num_lenses=1)
+    rng = np.random.default_rng(2)
+    problem = replace(problem, keypoints=problem.keypoints + 0.3 * rng.standard_cauchy(problem.keypoints.shape))
+    start = displaced(problem, truth, 0.003)
+    recorder = Recorder(monkeypatch)
+    found = adjust(problem, start, 0.3, tolerance=0.01).final_cost
+    longer = len(recorder.steps)
+    recorder.steps.clear()
+    monkeypatch.setattr(adjustment, "_lengthening", lambda *_: 1.0)
+    assert adjust(problem, start, 0.3, tolerance=0.01).final_cost == pytest.approx(found, rel=1e-5)
+    assert longer < len(recorder.steps)
