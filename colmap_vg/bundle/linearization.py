@@ -71,7 +71,7 @@ class Linearization:
 
     def change_to(self, other: "Linearization") -> Array:
         """Change (2, k) of the residuals to another state, with the weights of this one; 0 where either is lost."""
-        known = (self.roots > 0.0) & (other.roots > 0.0)
+        known = other.roots > 0.0
         share = np.where(known, self.roots / np.where(known, other.roots, 1.0), 0.0)
         return np.asarray(share * other.residuals - np.where(known, self.residuals, 0.0))
 

@@ -55,6 +55,16 @@ def test_steps_sideways_and_of_other_parameters_are_added() -> None:
         np.testing.assert_allclose(after, before + np.array([0.0, 0.0, 0.0, 0.01]), atol=1e-15)
 
 
+def test_a_step_sideways_grows_with_the_distance() -> None:
+    problem, truth = scene()
+    viewed = np.zeros_like(truth.centers)
+    sideways = 0.1 * np.cross(truth.centers, [0.0, 1.0, 0.0])
+    step = np.zeros(problem.num_unknowns)
+    step[: 6 * problem.num_images].reshape(-1, 6)[:, 3:] = 0.3 * truth.centers + sideways
+    moved = truth.moved(problem, step, truth.points, viewed)
+    np.testing.assert_allclose(moved.centers, np.exp(0.3) * (truth.centers + sideways), rtol=1e-12)
+
+
 def test_what_has_no_step_keeps_every_bit_and_huge_steps_are_bounded() -> None:
     problem, truth = scene()
     viewed = truth.viewed(problem)

@@ -160,6 +160,7 @@ def test_the_parameters_that_are_asked_for_are_free(refine: tuple[bool, bool, bo
     )
     lens = ColmapLens(camera, options)
     assert lens.free.tolist() == free
+    assert lens.focal.tolist() == [place in (0, 1) for place in free]
     rays = np.array([[0.1, 0.2, 1.0], [0.0, 0.0, -1.0]])
     projected = lens.project(np.array(camera.params), rays)
     np.testing.assert_allclose(projected[0], camera.img_from_cam(rays)[0])
