@@ -120,6 +120,15 @@ def test_inlier_bearings_are_rays_of_the_matched_keypoints(exact: tuple[Path, py
     assert np.array_equal(thinned.num_inliers, graph.num_inliers)
 
 
+def test_poses_of_pairs_are_refined_by_as_many_matches_as_asked_for(tmp_path: Path) -> None:
+    make_database(tmp_path / "a.db", num_images=4, num_points=300, noise_px=0.5)
+    every, some = (read_view_graph(tmp_path / "a.db", ReadOptions(max_matches_per_pose=n)) for n in (1000, 30))
+    rotations = [np.trace(graph.edge_information[:, :3, :3], axis1=1, axis2=2) for graph in (every, some)]
+    assert (every.num_inliers == 300).all()
+    assert 5.0 < np.median(rotations[0] / rotations[1]) < 20.0
+    assert np.array_equal(some.inlier_offsets, every.inlier_offsets)
+
+
 def test_the_graph_is_the_same_to_the_bit(exact: tuple[Path, pycolmap.Reconstruction]) -> None:
     one, other = read_view_graph(exact[0]), read_view_graph(exact[0])
     for name, value in vars(one).items():

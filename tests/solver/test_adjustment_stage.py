@@ -104,6 +104,17 @@ def whole(graph: ViewGraph) -> tuple[Subgraph, EpipolarProblem]:
     return part, problem
 
 
+def test_matches_and_tracks_are_as_many_as_asked_for() -> None:
+    graph, _ = bent_graph([FOCAL, FOCAL], [False, False], term=0.0)
+    part = Subgraph.of(graph.edges, np.ones(graph.num_images, dtype=bool), np.ones(graph.num_edges, dtype=bool))
+    for options in ({}, {"max_matches_per_edge": 20}, {"max_tracks_per_triplet": 7}):
+        problem = epipolar_problem(graph, part, SolveOptions(**options))
+        assert problem is not None
+        assert problem.triplets is not None
+        assert (np.diff(problem.offsets).max() <= 20) == ("max_matches_per_edge" in options)
+        assert (np.diff(problem.triplets.offsets).max() <= 7) == ("max_tracks_per_triplet" in options)
+
+
 def test_the_radial_term_is_that_of_the_cameras_that_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
     # Groups are in the order of focal lengths, unlike the cameras.
     graph, poses = bent_graph([1.01 * FOCAL, FOCAL, FOCAL], [True, False, False], term=-0.1)

@@ -43,3 +43,13 @@ def test_products_are_those_of_each_segment(at_a_time: int, monkeypatch: pytest.
     expected = [matrices[k] @ vectors[row] for k in range(8) for row in range(offsets[k], offsets[k + 1])]
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     assert segments.products_of_segments(matrices[:0], np.zeros(1, dtype=np.int64), vectors[:0]).shape == (0, 2)
+
+
+@pytest.mark.parametrize("limit", [1, 3, 5, 7])
+def test_thinned_rows_are_at_regular_intervals(limit: int) -> None:
+    counts = [0, 1, 5, 12, 3, 30]
+    kept = segments.evenly_thinned(np.concatenate([[0], np.cumsum(counts)]), limit)
+    most = [min(count, limit) for count in counts]
+    expected = [r * k // c != (r - 1) * k // c for c, k in zip(counts, most, strict=True) for r in range(c)]
+    assert kept.tolist() == expected
+    assert segments.evenly_thinned(np.array([0, 4, 9]), 0).all()
