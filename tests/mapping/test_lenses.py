@@ -1,10 +1,16 @@
 """Warnings of lenses that bundle adjustment made hardly real."""
 
+from pathlib import Path
+
 import pycolmap
 import pytest
+from synthetic_databases import make_database
 
 from colmap_vg.events import StageLog
+from colmap_vg.jobs.mapper import map_database
+from colmap_vg.mapping import lenses
 from colmap_vg.mapping.lenses import MAX_STRETCH, warn_of_stretched
+from colmap_vg.options import MappingOptions
 
 
 class Cameras:
@@ -67,3 +73,12 @@ def test_lenses_with_one_focal_length_have_no_ratio() -> None:
     before = Cameras(reconstruction)
     reconstruction.camera(1).params = [3000.0, 500.0, 400.0, 0.0]
     assert warnings(reconstruction, before) == []
+
+
+def test_jobs_ask_whether_they_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = ("PINHOLE", (1280.0, 1280.0, 512.0, 384.0))
+    make_database(tmp_path / "a.db", num_images=6, num_points=100, noise_px=0.5, camera=camera)
+    monkeypatch.setattr(lenses, "MAX_STRETCH", 1.0)
+    log = StageLog()
+    map_database(tmp_path / "a.db", None, tmp_path / "out", MappingOptions(), log)
+    assert any("focal lengths in x and y of 1 cameras" in told for told in log.warnings)
