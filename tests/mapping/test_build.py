@@ -1,8 +1,13 @@
-"""The options of building a model that reach pycolmap."""
+"""The options of building a model that reach pycolmap, and when its rounds of adjustment end."""
+
+from unittest.mock import Mock
 
 import pycolmap
 import pytest
 
+from colmap_vg.mapping import build
+from colmap_vg.mapping.build import MAX_NUM_ROUNDS
+from colmap_vg.mapping.bundle import NOTHING_HELD
 from colmap_vg.mapping.options import (
     MAX_NUM_STEPS,
     MIN_RESIDUALS_FOR_THREADS,
@@ -41,3 +46,40 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
     assert (mapper.abs_pose_refine_focal_length, mapper.abs_pose_refine_extra_params) == (switch, switch)
     assert (mapper.num_threads, mapper.random_seed) == (3, 7)
     assert triangulator_options(options).random_seed == 7
+
+
+@pytest.mark.parametrize(
+    ("ratios", "growth", "rounds"),
+    [
+        ([0.9], [1.005], 1),
+        ([0.9, 0.9], [1.05, 1.005], 2),  # a focal length still moves
+        ([0.5, 0.9], [1.0, 1.0], 2),  # so does the cost
+        ([0.5] * MAX_NUM_ROUNDS, [1.0] * MAX_NUM_ROUNDS, MAX_NUM_ROUNDS),
+    ],
+)
+def test_rounds_end_where_cost_and_focal_lengths_do(
+    ratios: list[float], growth: list[float], rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(
+            num_frames_per_rig=3,
+            num_points3D=20,
+            camera_model_id=pycolmap.CameraModelId.OPENCV,
+            camera_params=[900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0],
+        )
+    )
+    asked: list[bool] = []
+
+    def adjusted(*_: object, rough: bool = False) -> float:
+        asked.append(rough)
+        factor = 1.5 if rough else growth[len(asked) - 2]
+        for camera in model.cameras.values():
+            camera.params = [factor * camera.params[0], factor * camera.params[1], *camera.params[2:]]
+        return 0.1 if rough else ratios[len(asked) - 2]
+
+    mapper = Mock(reconstruction=model)
+    monkeypatch.setattr(build, "_adjust", adjusted)
+    assert build._adjust_to_convergence(mapper, MappingOptions(), NOTHING_HELD) == (ratios[rounds - 1] > 0.7)
+    assert asked == [True] + rounds * [False]
+    assert mapper.retriangulate.call_count == rounds
