@@ -123,7 +123,7 @@ def adjust(
             damping = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = damping if damping > FIRST_DAMPING else 0.0
         else:
-            damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
+            damping, growth, before = max(growth * damping, FIRST_DAMPING), 2.0 * growth, None
         if short or damping > MAX_DAMPING:
             break
         if found is there:

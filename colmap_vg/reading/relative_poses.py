@@ -176,7 +176,8 @@ def relative_poses(
     unchanged = (focal_scales[cameras] == 1.0).all(axis=1)
     poses = _initial_poses(tables, every.thinned(MAX_MATCHES_PER_CHOICE), K[cameras], planar, unchanged)
     focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
-    enough = np.diff(matches.offsets) >= max(options.min_num_inliers, 5)
+    num_matches = np.diff(every.offsets)
+    enough = num_matches >= max(options.min_num_inliers, 5)
     refined = refine_relative_poses(
         matches.offsets,
         matches.bearings1,
@@ -193,7 +194,6 @@ def relative_poses(
     medians = matches.medians(errors)
     still, turns = _pure_rotation(matches, final, medians)
     final = replace(final, rotations=np.where(still[:, None, None], turns, final.rotations))
-    num_matches = np.diff(every.offsets)
     fitting = matches.shares_within(errors, MAX_MEDIAN_ERROR_PX / pair_focal)
     unfit = (fitting < MIN_FITTING_SHARE) | (fitting * num_matches < MIN_NUM_FITTING)
     verdicts = _verdicts(

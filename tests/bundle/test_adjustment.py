@@ -331,6 +331,21 @@ def test_the_step_after_a_lengthened_one_is_not(monkeypatch: pytest.MonkeyPatch)
     assert asked == [False, True, False, True, False]
 
 
+def test_a_step_after_one_that_failed_is_not_lengthened(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, truth = scene(sigma_px=0.5)
+    costs_times([1.0, 1.3], monkeypatch)
+    asked: list[bool] = []
+
+    def recorded(system: ReducedSystem, before: np.ndarray | None, step: np.ndarray) -> float:
+        asked.append(before is not None)
+        return 1.0
+
+    monkeypatch.setattr(adjustment, "_lengthening", recorded)
+    monkeypatch.setattr(adjustment, "MAX_NUM_STEPS", 3)
+    adjust(problem, displaced(problem, truth, 0.01), 1.0, tolerance=1e-9)
+    assert asked == [False, False, False]
+
+
 def test_heavy_tails_take_fewer_steps_than_without_lengthening(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, truth = scene(12, 300, num_lenses=1)
     rng = np.random.default_rng(2)

@@ -127,6 +127,10 @@ def test_poses_of_pairs_are_refined_by_as_many_matches_as_asked_for(tmp_path: Pa
     assert (every.num_inliers == 300).all()
     assert 5.0 < np.median(rotations[0] / rotations[1]) < 20.0
     assert np.array_equal(some.inlier_offsets, every.inlier_offsets)
+    # A pair has as many matches as its list, not as its pose is refined by.
+    options = ReadOptions(max_matches_per_pose=30, min_num_inliers=200)
+    strict = read_view_graph(tmp_path / "a.db", options)
+    assert np.array_equal(strict.cam2_from_cam1_rotations, some.cam2_from_cam1_rotations)
 
 
 def test_the_graph_is_the_same_to_the_bit(exact: tuple[Path, pycolmap.Reconstruction]) -> None:
