@@ -4,7 +4,7 @@ Asking pycolmap for each keypoint takes 3 microseconds; COLMAP writes all of the
 """
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -59,7 +59,7 @@ class ModelObservations:
         with tempfile.TemporaryDirectory() as folder:
             reconstruction.write_binary(folder)
             content = (Path(folder) / "images.bin").read_bytes()
-            every_point, positions = _points((Path(folder) / "points3D.bin").read_bytes())
+            points = (Path(folder) / "points3D.bin").read_bytes()
         found, place = {}, 8
         _check_room(len(content) >= place)
         for _ in range(int.from_bytes(content[:8], "little")):
@@ -72,6 +72,7 @@ class ModelObservations:
             found[image_id] = keypoints[keypoints["point_id"] != _NO_POINT]
             place += 8 + count * _KEYPOINT.itemsize
         rows = np.concatenate([found[image_id] for image_id in sorted(found)] or [np.empty(0, _KEYPOINT)])
+        every_point, positions = _points(points, *np.unique(rows["point_id"], return_counts=True))
         return cls(
             image_ids=np.repeat(sorted(found), [len(found[image_id]) for image_id in sorted(found)]).astype(np.int64),
             point_ids=rows["point_id"].astype(np.int64),
@@ -80,23 +81,46 @@ class ModelObservations:
             positions=positions,
         )
 
+    def of_points_in(self, image_ids: list[int]) -> Self:
+        """All observations of the points that some of the given images see; `every_point` stays."""
+        wanted = np.unique(self.point_ids[np.isin(self.image_ids, image_ids)])
+        rows = np.flatnonzero(np.isin(self.point_ids, wanted))
+        return replace(
+            self, image_ids=self.image_ids[rows], point_ids=self.point_ids[rows], keypoints=self.keypoints[rows]
+        )
+
     def positions_of(self, point_ids: IntArray) -> Array:
         """Positions (n, 3) of some points of the model."""
         return np.asarray(self.positions[np.searchsorted(self.every_point, point_ids)])
 
 
-def _points(content: bytes) -> tuple[IntArray, Array]:
-    """Ids (q,), ascending, and positions (q, 3) of the points in COLMAP's binary file."""
-    starts, place = [], 8
+def _points(content: bytes, observed: NDArray[np.uint64], counts: IntArray) -> tuple[IntArray, Array]:
+    """Ids (q,), ascending, and positions (q, 3) of the points in COLMAP's binary file.
+
+    It holds the observed points with tracks of as many elements as they have observations, in the order of their ids,
+    unless some point has none: then each record tells where the next one starts.
+    """
+    ends = 8 + np.cumsum(_TRACK_LENGTH + 8 + _TRACK_ELEMENT * counts)
+    starts = np.concatenate([[8], ends]).astype(np.int64)
+    if starts[-1] == len(content):
+        heads = _heads(content, starts[:-1])
+        if np.array_equal(heads["id"], observed):
+            return heads["id"].astype(np.int64), np.ascontiguousarray(heads["xyz"])
+    places, place = [], 8
     for _ in range(int.from_bytes(content[:8], "little")):
-        starts.append(place)
+        places.append(place)
         length = place + _TRACK_LENGTH
         place = length + 8 + _TRACK_ELEMENT * int.from_bytes(content[length : length + 8], "little")
     _check_room(place == len(content))
-    places = np.array(starts, dtype=np.int64)[:, None] + np.arange(_POINT)
-    heads = np.frombuffer(content, np.uint8)[places].view(np.dtype([("id", "<u8"), ("xyz", "<f8", 3)])).reshape(-1)
-    order = np.argsort(heads["id"], kind="stable")
-    return heads["id"][order].astype(np.int64), np.ascontiguousarray(heads["xyz"][order])
+    heads = _heads(content, np.array(places, dtype=np.int64))
+    heads = heads[np.argsort(heads["id"], kind="stable")]
+    return heads["id"].astype(np.int64), np.ascontiguousarray(heads["xyz"])
+
+
+def _heads(content: bytes, starts: IntArray) -> NDArray[np.void]:
+    """Records (q,) of id and position that begin at some bytes."""
+    bytes_of_heads = np.frombuffer(content, np.uint8)[starts[:, None] + np.arange(_POINT)]
+    return np.asarray(bytes_of_heads.view(np.dtype([("id", "<u8"), ("xyz", "<f8", 3)])).reshape(-1))
 
 
 def _check_room(is_whole: bool) -> None:

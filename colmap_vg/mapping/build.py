@@ -5,7 +5,7 @@ a mapper that starts from rough poses needs many.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,7 @@ from colmap_vg.mapping.options import (
 )
 from colmap_vg.mapping.pair_agreement import PairRotations, pair_agreement
 from colmap_vg.mapping.snapshot import TRADING_OFF
-from colmap_vg.mapping.support import supported_observations
+from colmap_vg.mapping.support import is_supported, supported_observations
 from colmap_vg.options import MappingOptions
 
 MIN_SUPPORTED_OBSERVATIONS = 15
@@ -142,6 +142,7 @@ def finish_registration(
     pairs: PairRotations,
     held: Held,
     kept_frames: frozenset[int],
+    placed: Mapping[int, "pycolmap.Rigid3d"] | None = None,
 ) -> BuildResult:
     """Register images by the points of a finished model, and adjust it, as a stage.
 
@@ -157,19 +158,23 @@ def finish_registration(
         What is not adjusted.
     kept_frames : frozenset of int
         Ids of frames that stay registered in any case.
+    placed : mapping of int to pycolmap.Rigid3d, optional
+        Poses, rig from world, of frames to register first.
     """
     model, added, misplaced = mapper.reconstruction, set[int](), set[int]()
     with log.stage("register"):
+        found = _register_placed(mapper, options, placed or {})
         while True:
-            found = _register_left_out(mapper, options, frozenset(misplaced))
+            found |= register_left_out(mapper, options, frozenset(misplaced))
             wrong = _remove_misplaced(mapper, found, pairs)
             misplaced, found = misplaced | wrong, found - wrong
             if not found:
                 break
             added |= found
-            mapper.complete_and_merge_tracks(triangulator_options(options))
+            _complete_new_tracks(mapper, options)
             _adjust(mapper, options, held)
             added -= _remove_unsupported(mapper, kept_frames)
+            found = set()
         folded = _warn_of_folds(model, pairs, log)
         log.result(f"{len(added)} images added, {_state(model)}")
     return BuildResult(frozenset(misplaced), folded)
@@ -204,7 +209,7 @@ def _register_remaining(
     """Deregister images without support and register images by their points; return the ids of the misplaced ones."""
     removed = _remove_unsupported(mapper)
     # A removed image may be registered again by its points: its pose from the view graph was wrong.
-    added = _register_left_out(mapper, options, others)
+    added = register_left_out(mapper, options, others)
     removed -= added
     misplaced = _remove_misplaced(mapper, added, pairs)
     added -= misplaced
@@ -282,8 +287,16 @@ def _remove_unsupported(mapper: "pycolmap.IncrementalMapper", kept_frames: froze
     removed: set[int] = set()
     while True:
         frames = {i: reconstruction.image(i).frame_id for i in sorted(reconstruction.reg_image_ids())}
+        certain = kept_frames | {
+            frame_id
+            for image_id, frame_id in frames.items()
+            if frame_id not in kept_frames
+            and is_supported(reconstruction, image_id, MIN_TRIANGULATION_ANGLE_DEG, MIN_SUPPORTED_OBSERVATIONS)
+        }
+        if certain.issuperset(frames.values()):
+            return removed
         support: Counter[int] = Counter()
-        counts = supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG, without_frames=kept_frames)
+        counts = supported_observations(reconstruction, MIN_TRIANGULATION_ANGLE_DEG, without_frames=certain)
         for image_id, count in counts.items():
             support[frames[image_id]] += count
         weak = [(count, frame_id) for frame_id, count in support.items() if count < MIN_SUPPORTED_OBSERVATIONS]
@@ -294,10 +307,18 @@ def _remove_unsupported(mapper: "pycolmap.IncrementalMapper", kept_frames: froze
         mapper.observation_manager.deregister_frame(frame_id)
 
 
-def _register_left_out(
-    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, never: frozenset[int]
+def register_left_out(
+    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, never: frozenset[int] = frozenset()
 ) -> set[int]:
-    """Register images by PnP against the points, best first, until none can be added; return their ids."""
+    """Register images by PnP against the points, best first, until none can be added; return their ids.
+
+    Parameters
+    ----------
+    mapper : pycolmap.IncrementalMapper
+    options : MappingOptions
+    never : frozenset of int, optional
+        Ids of images that are not registered.
+    """
     registration, triangulator = mapper_options(options), triangulator_options(options)
     added: set[int] = set()
     while True:
@@ -305,13 +326,39 @@ def _register_left_out(
         for image_id in candidates:
             report_progress("images that are left")
             if mapper.register_next_image(registration, image_id):
-                together = _images_of(mapper.reconstruction, mapper.reconstruction.image(image_id).frame_id)
-                for each in sorted(together):
-                    mapper.triangulate_image(triangulator, each)
-                added |= together
+                added |= _triangulate_frame(mapper, triangulator, mapper.reconstruction.image(image_id).frame_id)
                 break
         else:
             return added
+
+
+def _register_placed(
+    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, placed: Mapping[int, "pycolmap.Rigid3d"]
+) -> set[int]:
+    """Register frames with poses that are nearly right; return the ids of their images."""
+    triangulator, added = triangulator_options(options), set[int]()
+    for frame_id, pose in placed.items():
+        mapper.reconstruction.frame(frame_id).rig_from_world = pose
+        mapper.observation_manager.register_frame(frame_id)
+        added |= _triangulate_frame(mapper, triangulator, frame_id)
+    return added
+
+
+def _triangulate_frame(
+    mapper: "pycolmap.IncrementalMapper", triangulator: "pycolmap.IncrementalTriangulatorOptions", frame_id: int
+) -> set[int]:
+    """Triangulate the points of a frame's images; return the ids of these."""
+    together = _images_of(mapper.reconstruction, frame_id)
+    for each in sorted(together):
+        mapper.triangulate_image(triangulator, each)
+    return together
+
+
+def _complete_new_tracks(mapper: "pycolmap.IncrementalMapper", options: MappingOptions) -> None:
+    """Complete and merge the tracks that changed since the mapper began; it knew the others as they are."""
+    triangulator = triangulator_options(options)
+    mapper.triangulator.complete_tracks(triangulator, mapper.get_modified_points3D())
+    mapper.triangulator.merge_tracks(triangulator, mapper.get_modified_points3D())
 
 
 def _remove_misplaced(mapper: "pycolmap.IncrementalMapper", added: set[int], pairs: PairRotations | None) -> set[int]:

@@ -78,6 +78,9 @@ def adjust_bundle(
         Ratio of the final to the initial cost; 1 without observations.
     """
     observed = ModelObservations.of(reconstruction)
+    if held.frames:
+        images = [reconstruction.image(i) for i in sorted(reconstruction.reg_image_ids())]
+        observed = observed.of_points_in([image.image_id for image in images if image.frame_id not in held.frames])
     scale = loss_scale(reconstruction, MIN_TRACK_LENGTH, observed)
     if not priors and not has_rigs(reconstruction):
         ratio = 1.0

@@ -12,8 +12,14 @@ from colmap_vg.colmap_io.loading import loaded_reconstruction
 from colmap_vg.errors import DataFileError
 from colmap_vg.events import StageLog
 from colmap_vg.geometry.similarity import align_positions
-from colmap_vg.mapping.build import BuildResult, finish_registration, settle_given_poses, triangulate_registered
+from colmap_vg.mapping.build import (
+    BuildResult,
+    finish_registration,
+    settle_given_poses,
+    triangulate_registered,
+)
 from colmap_vg.mapping.bundle import held_of
+from colmap_vg.mapping.options import mapper_options
 from colmap_vg.mapping.pair_agreement import PairRotations
 from colmap_vg.options import MappingOptions
 
@@ -21,6 +27,8 @@ Array = NDArray[np.float64]
 
 NUM_COMPARED, SAME_KEYPOINT_PX = 20, 0.01
 """Number of keypoints of each image that are compared, and maximum distance between those that are the same, pixels."""
+NUM_OBSERVATIONS_TO_REGISTER = 500
+"""Observations of an image that suffice to register it before bundle adjustment."""
 
 
 def read_input_model(input_path: str | PathLike[str]) -> "pycolmap.Reconstruction":
@@ -98,10 +106,16 @@ def extend_model(
         model = loaded_reconstruction(cache)
         ids = {image.name: image_id for image_id, image in model.images.items()}
         old = {image_id: ids[given.image(image_id).name] for image_id in sorted(given.reg_image_ids())}
-        _copy_cameras(given, model, old, log)
-        _copy_poses(given, model, old)
-        copied = _copy_points(given, model, old)
+        if _is_part_of(given, model):
+            model = pycolmap.Reconstruction(given)
+            model.load(cache)
+            copied = model.num_points3D()
+        else:
+            _copy_cameras(given, model, old, log)
+            _copy_poses(given, model, old)
+            copied = _copy_points(given, model, old)
         log.result(f"{len(old)} images and {copied} points of the given model")
+        placed = _registered_by_sample(cache, model, options)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     frames = {model.image(image_id).frame_id for image_id in old.values()}
@@ -110,7 +124,7 @@ def extend_model(
     if copied == 0:
         triangulate_registered(mapper, options, log)
         settle_given_poses(mapper, options, held)
-    result = finish_registration(mapper, options, log, pairs, held, frozenset(frames))
+    result = finish_registration(mapper, options, log, pairs, held, frozenset(frames), placed)
     mapper.end_reconstruction(False)
     if not options.fix_existing_frames:
         _align(given, model, old)
@@ -153,16 +167,47 @@ def _copy_poses(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstructio
             model.register_frame(image.frame_id)
 
 
+def _is_part_of(given: "pycolmap.Reconstruction", whole: "pycolmap.Reconstruction") -> bool:
+    """Whether all that a model holds has the same ids, and its images the same keypoints, in that of the database."""
+    for image_id, image in given.images.items():
+        if not whole.exists_image(image_id):
+            return False
+        own = whole.image(image_id)
+        if (own.name, own.camera_id, own.frame_id) != (image.name, image.camera_id, image.frame_id):
+            return False
+        if not _same_keypoints(image, own):
+            return False
+    frames = all(
+        whole.exists_frame(frame_id) and _contents(frame) == _contents(whole.frame(frame_id))
+        for frame_id, frame in given.frames.items()
+    )
+    return frames and all(
+        whole.exists_rig(rig_id) and _sensors(rig) == _sensors(whole.rig(rig_id)) for rig_id, rig in given.rigs.items()
+    )
+
+
+def _contents(frame: "pycolmap.Frame") -> tuple[int, list[int]]:
+    return frame.rig_id, sorted(data.id for data in frame.image_ids)
+
+
+def _sensors(rig: "pycolmap.Rig") -> tuple[int, list[int]]:
+    return rig.ref_sensor_id.id, sorted(sensor.id for sensor in rig.non_ref_sensors)
+
+
+def _same_keypoints(one: "pycolmap.Image", other: "pycolmap.Image") -> bool:
+    """Whether two images have as many keypoints, and a sample of them is at the same places."""
+    count = one.num_points2D()
+    if other.num_points2D() != count:
+        return False
+    places = range(0, count, max(count // NUM_COMPARED, 1))
+    keypoints, same = ([image.point2D(place).xy for place in places] for image in (one, other))
+    return bool(np.abs(np.subtract(keypoints, same)).max(initial=0.0) <= SAME_KEYPOINT_PX)
+
+
 def _copy_points(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", old: dict[int, int]) -> int:
-    """Copy the points if a sample of the keypoints of all images are the database's; return their number."""
-    for image_id, new_id in old.items():
-        own, theirs = model.image(new_id), given.image(image_id)
-        if own.num_points2D() != theirs.num_points2D():
-            return 0
-        places = range(0, own.num_points2D(), max(own.num_points2D() // NUM_COMPARED, 1))
-        keypoints, same = ([image.point2D(place).xy for place in places] for image in (own, theirs))
-        if np.abs(np.subtract(keypoints, same)).max(initial=0.0) > SAME_KEYPOINT_PX:
-            return 0
+    """Copy the points if the keypoints of all images are the database's; return their number."""
+    if not all(_same_keypoints(given.image(image_id), model.image(new_id)) for image_id, new_id in old.items()):
+        return 0
     same_ids = all(image_id == new_id for image_id, new_id in old.items())
     for _, point in sorted(given.points3D.items()):
         track = point.track if same_ids else _renumbered(point.track, old)
@@ -175,6 +220,39 @@ def _renumbered(track: "pycolmap.Track", old: dict[int, int]) -> "pycolmap.Track
     for element in track.elements:
         renumbered.add_element(old[element.image_id], element.point2D_idx)
     return renumbered
+
+
+def _registered_by_sample(
+    cache: "pycolmap.DatabaseCache", model: "pycolmap.Reconstruction", options: MappingOptions
+) -> dict[int, "pycolmap.Rigid3d"]:
+    """Poses of frames that a sample of a model's points tells, rig from world; none where the points are few.
+
+    Bundle adjustment decides the final poses; to register an image by thousands of points takes ten times as long.
+    Cameras that had no registered image get the calibrations that belong to the poses.
+    """
+    ids, images = sorted(model.point3D_ids()), max(model.num_reg_images(), 1)
+    every = model.compute_num_observations() // (images * NUM_OBSERVATIONS_TO_REGISTER)
+    if every < 2:
+        return {}
+    thinned = pycolmap.Reconstruction(model)
+    kept = set(ids[::every])
+    for point_id in ids:
+        if point_id not in kept:
+            thinned.delete_point3D(point_id)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(thinned)
+    registration = mapper_options(options)
+    candidates = mapper.find_next_images(registration, False)
+    found = dict[int, "pycolmap.Rigid3d"]()
+    for image_id in candidates:
+        image = thinned.image(image_id)
+        if image.frame_id not in found and mapper.register_next_image(registration, image_id):
+            pose = thinned.frame(image.frame_id).rig_from_world
+            if pose is not None:
+                found[image.frame_id] = pycolmap.Rigid3d(pose.matrix())
+            model.camera(image.camera_id).params = thinned.camera(image.camera_id).params.tolist()
+    mapper.end_reconstruction(False)
+    return found
 
 
 def _align(given: "pycolmap.Reconstruction", model: "pycolmap.Reconstruction", old: dict[int, int]) -> None:

@@ -34,9 +34,11 @@ def supported_observations(
     registered = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
     asked = np.array([reconstruction.image(i).frame_id not in without_frames for i in registered.tolist()], dtype=bool)
     seen = ModelObservations.of(reconstruction)
+    if without_frames:
+        seen = seen.of_points_in(registered[asked].tolist())
     image_row = np.searchsorted(registered, seen.image_ids)
     every, row, length = np.unique(seen.point_ids, return_inverse=True, return_counts=True)
-    long = (length >= min_track_length) & (np.bincount(row, asked[image_row], len(every)) > 0.0)
+    long = length >= min_track_length
     by_point = np.argsort(row, kind="stable")
     by_point = by_point[long[row[by_point]]]
     image_row = image_row[by_point]
@@ -50,6 +52,51 @@ def supported_observations(
     wide = _widest_angles(rays, offsets) >= np.radians(min_angle_deg)
     counts = np.bincount(image_row[wide[point_row]], minlength=len(registered))
     return dict(zip(registered[asked].tolist(), counts[asked].tolist(), strict=True))
+
+
+def is_supported(
+    reconstruction: "pycolmap.Reconstruction", image_id: int, min_angle_deg: float, min_count: int, num_asked: int = 100
+) -> bool:
+    """Whether a sample of an image's keypoints has enough observations of those that `supported_observations` counts.
+
+    Parameters
+    ----------
+    reconstruction : pycolmap.Reconstruction
+    image_id : int
+        A registered image.
+    min_angle_deg : float
+        Minimum angle between this image's ray to a point and another one's, degrees.
+    min_count : int
+    num_asked : int, optional
+        Maximum number of keypoints of the sample that have points.
+
+    Returns
+    -------
+    bool
+        If not, only counting all of them tells.
+    """
+    image, max_cosine = reconstruction.image(image_id), np.cos(np.radians(min_angle_deg))
+    center, found, asked = image.projection_center(), 0, 0
+    # Consecutive keypoints are of similar scale: the stride makes neighbours in the sample far apart.
+    count, centers = image.num_points2D(), dict[int, Array]()
+    for place in np.argsort(np.arange(count) % max(count // num_asked, 1), kind="stable").tolist():
+        if found >= min_count or asked >= num_asked:
+            break
+        keypoint = image.point2D(place)
+        if not keypoint.has_point3D():
+            continue
+        asked += 1
+        point = reconstruction.point3D(keypoint.point3D_id)
+        seen_by = {element.image_id for element in point.track.elements}
+        if len(seen_by) < 3:
+            continue
+        for other in seen_by:
+            if other not in centers:
+                centers[other] = reconstruction.image(other).projection_center()
+        rays = np.array([center, *(centers[other] for other in sorted(seen_by))]) - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        found += bool((rays @ rays[0]).min() <= max_cosine)
+    return found >= min_count
 
 
 def _widest_angles(rays: Array, offsets: NDArray[np.int64]) -> Array:

@@ -36,6 +36,33 @@ def test_they_are_those_of_the_registered_images() -> None:
     np.testing.assert_array_equal(found.positions_of(some), [model.point3D(i).xyz for i in some.tolist()])
 
 
+def test_points_that_no_image_sees_have_positions_too() -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=3, num_points3D=20))
+    model.delete_point3D(5)
+    model.add_point3D_with_id(5, pycolmap.Point3D(xyz=[1.0, 2.0, 3.0]))
+    found = ModelObservations.of(model)
+    assert found.every_point.tolist() == list(range(1, 21))
+    np.testing.assert_array_equal(found.positions, [model.point3D(i).xyz for i in range(1, 21)])
+    assert not np.isin(5, found.point_ids)
+
+
+def test_observations_of_the_points_in_an_image() -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(num_frames_per_rig=6, num_points3D=40, track_length=3)
+    )
+    every = ModelObservations.of(model)
+    found = every.of_points_in([2])
+    points = {keypoint.point3D_id for keypoint in model.image(2).get_observation_points2D()}
+    assert 0 < len(points) < 40
+    expected = [k for k, point_id in enumerate(every.point_ids.tolist()) if point_id in points]
+    np.testing.assert_array_equal(found.point_ids, every.point_ids[expected])
+    np.testing.assert_array_equal(found.image_ids, every.image_ids[expected])
+    np.testing.assert_array_equal(found.keypoints, every.keypoints[expected])
+    assert len(every.of_points_in([]).keypoints) == 0
+
+
 def test_a_model_without_images_has_none() -> None:
     found = ModelObservations.of(pycolmap.Reconstruction())
     assert found.keypoints.shape == (0, 2)

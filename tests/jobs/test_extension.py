@@ -18,6 +18,8 @@ from colmap_vg.errors import DataFileError
 from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
 from colmap_vg.jobs.mapper import map_database
+from colmap_vg.mapping import extension
+from colmap_vg.mapping.build import finish_registration
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.views import FOCAL_PX, HEIGHT, WIDTH, SyntheticViews, synthetic_views
 
@@ -110,6 +112,51 @@ def test_a_model_of_other_keypoints_gives_its_poses_only(scene: Path, tmp_path: 
     names = sorted(poses(joint))
     distances, _ = align_positions(centers(models[0], names), centers(joint, names))
     assert distances.max() < 1e-3 * radius(centers(joint, names))
+
+
+def test_images_with_many_points_are_registered_by_a_sample(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extension, "NUM_OBSERVATIONS_TO_REGISTER", 60)
+    given: list[int] = []
+
+    def finish(mapper, options, log, pairs, held, kept, placed):
+        given.extend(sorted(placed))
+        return finish_registration(mapper, options, log, pairs, held, kept, placed)
+
+    monkeypatch.setattr(extension, "finish_registration", finish)
+    models = view_graph_mapping(scene / "all.db", None, tmp_path / "out", OPTIONS, input_path=scene / "old" / "0")
+    assert given == list(NEW)
+    joint = pycolmap.Reconstruction(scene / "joint" / "0")
+    names = sorted(poses(joint))
+    distances, _ = align_positions(centers(models[0], names), centers(joint, names))
+    assert distances.max() < 1e-3 * radius(centers(joint, names))
+
+
+def test_a_model_is_part_of_another_by_ids_names_and_keypoints(scene: Path) -> None:
+    old, joint = (pycolmap.Reconstruction(scene / name / "0") for name in ("old", "joint"))
+    assert extension._is_part_of(old, joint)
+    assert not extension._is_part_of(joint, old)
+    old.image(1).name = "other.jpg"
+    assert not extension._is_part_of(old, joint)
+
+
+def test_a_model_with_other_rigs_is_no_part_of_another() -> None:
+    def two_images(num_cameras: int) -> pycolmap.Reconstruction:
+        """Two images of one rig and frame, or of a rig and a frame each."""
+        return pycolmap.synthesize_dataset(
+            pycolmap.SyntheticDatasetOptions(
+                num_rigs=3 - num_cameras, num_cameras_per_rig=num_cameras, num_frames_per_rig=1, num_points3D=5
+            )
+        )
+
+    models = [two_images(1), two_images(2)]
+    for model in models:
+        for image_id in (1, 2):
+            model.image(image_id).name = str(image_id)
+            for keypoint in model.image(image_id).points2D:
+                keypoint.xy = np.zeros(2)
+    assert [extension._is_part_of(a, b) for a in models for b in models] == [True, False, False, True]
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 3.0])

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from synthetic_databases import PINHOLE
 
-from colmap_vg.mapping.support import supported_observations
+from colmap_vg.mapping.support import is_supported, supported_observations
 
 
 def brute_force(model: pycolmap.Reconstruction, min_angle_deg: float, min_track_length: int) -> dict[int, int]:
@@ -54,6 +54,18 @@ def test_images_of_some_frames_alone_are_counted() -> None:
     assert supported_observations(model, 1.5, without_frames=frames) == expected
     every = frozenset(model.reg_frame_ids())
     assert supported_observations(model, 1.5, without_frames=every) == {}
+
+
+def test_a_sample_tells_what_has_support() -> None:
+    model, angle = make_model(9, 80, 4, seed=3), 1.5
+    counts = supported_observations(model, angle)
+    for image_id, count in counts.items():
+        assert is_supported(model, image_id, angle, count)
+        assert not is_supported(model, image_id, angle, count + 1)
+        assert not is_supported(model, image_id, 179.0, 1)
+    assert min(counts.values()) > 10
+    assert not is_supported(model, 1, angle, counts[1], num_asked=counts[1] - 1)
+    assert not any(is_supported(make_model(9, 80, 2, seed=2), image_id, angle, 1) for image_id in range(1, 10))
 
 
 def test_a_far_point_does_not_count() -> None:
