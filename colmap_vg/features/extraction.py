@@ -1,11 +1,10 @@
-"""Features of a folder of photographs, into a COLMAP database, and their matches.
+"""Features of a folder of photographs, into a COLMAP database.
 
 pycolmap reads the EXIF orientation itself: features are found on the upright image, and written in the pixels of the
 image as it is stored, with the camera of the stored size. So photographs of one phone share their camera's geometry
 however it was held, and nothing has to be rotated here.
 """
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -17,7 +16,6 @@ import pycolmap
 from colmap_vg.errors import ImageFolderError, OptionError
 from colmap_vg.events import StageLog
 from colmap_vg.features.masks import with_masks
-from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import (
     MIN_IMAGES,
     Photograph,
@@ -25,9 +23,7 @@ from colmap_vg.features.photographs import (
     find_photographs,
     split_odd_sizes,
 )
-from colmap_vg.features.rigs import configure_rigs, wants_rigs, with_rig_cameras
 from colmap_vg.features.sift_extraction import extract_sift
-from colmap_vg.features.staging import readable_folder
 from colmap_vg.linear.threads import num_workers
 from colmap_vg.options import FeatureOptions
 
@@ -56,48 +52,6 @@ class FeatureResult:
     image_names: tuple[str, ...]
     skipped: tuple[SkippedFile, ...]
     num_verified_pairs: int
-
-
-def extract_and_match(
-    image_path: str | PathLike[str],
-    database_path: str | PathLike[str],
-    options: FeatureOptions | None = None,
-    log: StageLog | None = None,
-) -> FeatureResult:
-    """Make a database of features and verified matches from a folder of photographs.
-
-    What the database already holds is kept: an interrupted job goes on where it stopped.
-
-    Parameters
-    ----------
-    image_path : path
-        Folder of photographs, searched recursively.
-    database_path : path
-        Created when missing.
-    options : FeatureOptions, optional
-    log : StageLog, optional
-
-    Returns
-    -------
-    FeatureResult
-
-    Raises
-    ------
-    ImageFolderError
-        The folder is missing, or holds fewer than three photographs that can be used.
-    OptionError
-        The camera model is unknown, or does not take so many parameters.
-    """
-    options, log = with_rig_cameras(FeatureOptions.given(options)), log or StageLog()
-    photographs, skipped = check_photographs(image_path, options, log)
-    names = [photograph.name for photograph in photographs]
-    copies = Path(f"{os.fspath(database_path)}-copies")
-    with readable_folder(image_path, photographs, options, copies) as (folder, reading):
-        names, unreadable = extract_features(folder, database_path, names, reading, log)
-    if wants_rigs(options):
-        configure_rigs(database_path, options)
-    num_pairs = match_features(database_path, options, log)
-    return FeatureResult(tuple(names), (*skipped, *unreadable), num_pairs)
 
 
 def check_photographs(

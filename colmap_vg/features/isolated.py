@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -25,12 +26,11 @@ import pycolmap
 from colmap_vg import errors
 from colmap_vg.errors import ColmapVgError, ImageFolderError, OutputError
 from colmap_vg.events import StageEvent, StageLog
-from colmap_vg.features.extraction import extract_features
-from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import SkippedFile
 from colmap_vg.options import FeatureOptions
 
-_TASKS: dict[str, Callable[..., object]] = {"features": extract_features, "matching": match_features}
+_TASKS = {"features": ("extraction", "extract_features"), "matching": ("matching", "match_features")}
+"""Module and function of each task; the process imports what it runs, which takes as long as ten pairs."""
 _LENGTH = struct.Struct("<Q")
 _WRITE_FAULTS = ("disk is full", "disk I/O error", "readonly database", "No space left", "File too large")
 """Error messages of sqlite and the operating system when a database cannot grow."""
@@ -172,7 +172,7 @@ def serve() -> None:
     pycolmap.logging.minloglevel = level
     log = StageLog(lambda event: _pass_on(event, answers))
     try:
-        value = _TASKS[task](*arguments, log)
+        value = _function(task)(*arguments, log)
     except ColmapVgError as error:
         answer = {"error": type(error).__name__, "message": str(error)}
     except (RuntimeError, OSError, MemoryError) as error:
@@ -180,6 +180,12 @@ def serve() -> None:
     else:
         answer = {"value": pickle.dumps(value).hex(), "result": log.records[-1].message}
     _tell(answers, answer)
+
+
+def _function(task: str) -> Callable[..., object]:
+    module, name = _TASKS[task]
+    function: Callable[..., object] = getattr(import_module(f"colmap_vg.features.{module}"), name)
+    return function
 
 
 def _request(pipe: IO[bytes]) -> bytes | None:

@@ -14,9 +14,9 @@ from colmap_vg.features.pair_matching import (
     MAX_FIRST_FEATURES,
     ImageFeatures,
     PairMatches,
+    agreement,
     match_all_features,
     match_pair,
-    num_consistent_matches,
 )
 from colmap_vg.features.pair_selection import strongest
 from colmap_vg.features.pairings import SELECTION_SHARE, selected_pairs, sequential_pairs, spatial_pairs
@@ -181,7 +181,7 @@ class _Matcher:
         if not any(image.has_more for image in images):
             return False  # all features are matched already
         matches = np.asarray(self._database.read_matches(first, second), dtype=np.int64).reshape(-1, 2)
-        return num_consistent_matches(*images, matches) > 0
+        return agreement(*images, matches)[1] > 0.0
 
     def _write(self, first: int, second: int, found: PairMatches) -> None:
         """Write a pair, in place of what the database holds of it."""

@@ -7,7 +7,6 @@ from os import PathLike
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from colmap_vg.colmap_io.pose_priors import read_pose_priors
 from colmap_vg.errors import ImageFolderError
@@ -138,6 +137,8 @@ def spatial_pairs(database_path: str | PathLike[str], log: StageLog) -> tuple[Na
     names, positions = [*located], np.array([*located.values()])
     lacking = [name for name in every if name not in located]
     neighbors = min(MAX_SPATIAL_NEIGHBORS + 1, len(names))
+    from scipy.spatial import cKDTree  # takes 0.1 s to import, in vain without positions
+
     distances, nearest = cKDTree(positions).query(positions, neighbors)
     near = (distances <= MAX_DISTANCE) & (nearest != np.arange(len(names))[:, None])
     rows = np.stack([np.nonzero(near)[0], nearest[near]], axis=1)

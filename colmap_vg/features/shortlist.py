@@ -8,8 +8,6 @@ descriptors and the nearest of a few words, normalised word by word (Arandjelovi
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
-from scipy.spatial import cKDTree
 
 from colmap_vg.linear.assembly import sum_at_nodes
 from colmap_vg.linear.threads import single_threaded_blas
@@ -65,6 +63,8 @@ def shortlisted(descriptors: NDArray[np.uint8], positions: NDArray[np.float64], 
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
     if len(known) > 1:
         neighbors = min(GPS_NEIGHBORS + 1, len(known))
+        from scipy.spatial import cKDTree  # takes 0.1 s to import, in vain in small folders
+
         found = cKDTree(positions[known]).query(positions[known], neighbors)[1]
         near[np.repeat(known, neighbors), known[found].ravel()] = True
     near |= near.T
@@ -114,6 +114,8 @@ def aggregated(descriptors: NDArray[np.uint8], seed: int) -> NDArray[np.float32]
     if not len(every):
         return np.zeros((n, NUM_WORDS * width), np.float32)
     sample = every[np.linspace(0, len(every) - 1, min(len(every), _TRAINING_DESCRIPTORS)).astype(np.int64)]
+    from scipy.cluster.vq import kmeans2  # as above
+
     words, _ = kmeans2(sample, min(NUM_WORDS, len(sample)), iter=_ROUNDS, minit="++", rng=np.random.default_rng(seed))
     nearest = np.argmin(np.square(words).sum(axis=1) - 2.0 * every @ words.T, axis=1)
     image = np.repeat(np.arange(n), present.sum(axis=1))

@@ -367,7 +367,8 @@ def _with_database_cameras(
     log: StageLog,
 ) -> "pycolmap.Reconstruction":
     """Give a model the database's own cameras; with the shared calibrations unless separate ones fit clearly better."""
-    trial = with_database_cameras(cache, shared, replaced)
+    model = with_database_cameras(cache, shared, replaced)
+    trial = pycolmap.Reconstruction(model)
     cost_ratio = adjust_once_more(cache, trial, options, rough=True)
     if cost_ratio < SHARED_LENS_COST_RATIO:
         for _ in range(MAX_NUM_ROUNDS):
@@ -376,7 +377,6 @@ def _with_database_cameras(
         log.result(f"different lenses: with separate calibrations the cost falls by {1.0 - cost_ratio:.0%}")
         return trial
     log.result(f"one lens: with separate calibrations the cost would fall by only {1.0 - cost_ratio:.1%}")
-    model = with_database_cameras(cache, shared, replaced)
     model.tear_down()  # removes the cameras, rigs and images of other models
     return model
 

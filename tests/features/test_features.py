@@ -7,11 +7,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from photograph_databases import extract_and_match
 from rendered_corner import HEIGHT, WIDTH, Corner, render_corner, write_jpeg
 
 from colmap_vg.errors import ImageFolderError, OptionError
 from colmap_vg.events import StageLog
-from colmap_vg.features.extraction import extract_and_match, extract_features, read_image_list
+from colmap_vg.features.extraction import extract_features, read_image_list
 from colmap_vg.features.matching import match_features
 from colmap_vg.features.photographs import Photograph, find_photographs, split_odd_sizes
 from colmap_vg.features.sift_extraction import extract_sift, image_features

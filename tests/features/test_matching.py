@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from photograph_databases import extract_and_match
 from rendered_corner import Corner, render_corner, write_jpeg
 
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.events import StageLog
 from colmap_vg.features import matching, pair_matching, pairings
-from colmap_vg.features.extraction import extract_and_match
 from colmap_vg.features.matching import match_features, match_pairs
 from colmap_vg.features.orientation_votes import excess_over_chance
 from colmap_vg.features.pair_selection import preemptive_matches, select_pairs

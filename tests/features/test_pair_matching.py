@@ -158,6 +158,11 @@ def test_few_features_are_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
     count = NUM_LARGE + NUM_SMALL + NUM_CLUTTER
     with_first(scene, count).matched()
     assert compared == [(count, count)]
+    # Of images that show different things no more features are compared.
+    compared.clear()
+    unlike = with_first(Pair(scene.first, pair(4, lens=camera()).second), 1000)
+    assert len(unlike.matched().geometry.inlier_matches) == 0
+    assert compared == [(200, 200)]
 
 
 def test_few_features_are_verified_by_the_options_given(monkeypatch: pytest.MonkeyPatch) -> None:

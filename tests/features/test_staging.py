@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from photograph_databases import extract_and_match
 from rendered_corner import HEIGHT, WIDTH, render_corner, write_jpeg
 
 from colmap_vg.errors import ImageFolderError
 from colmap_vg.events import StageLog
-from colmap_vg.features.extraction import extract_and_match
 from colmap_vg.features.photographs import find_photographs
 from colmap_vg.features.pixels import stretched
 from colmap_vg.jobs.image_folder import make_database
