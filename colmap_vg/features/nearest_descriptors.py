@@ -44,19 +44,45 @@ def mutual_matches(descriptors1: Bytes, descriptors2: Bytes) -> IntArray:
     (k, 2) int64 array
         Rows of both, in the order of the first.
     """
-    best = _Nearest(len(descriptors1), len(descriptors2))
+    return more_mutual_matches(descriptors1, descriptors2, None)[0]
+
+
+def more_mutual_matches(
+    descriptors1: Bytes, descriptors2: Bytes, known: "Nearest | None"
+) -> tuple[IntArray, "Nearest"]:
+    """Match as :func:`mutual_matches` does, where the leading descriptors have been compared before.
+
+    Parameters
+    ----------
+    descriptors1, descriptors2 : (n, d), (m, d) uint8 array
+    known : Nearest or None
+        Of the leading descriptors of both, which are not compared again.
+
+    Returns
+    -------
+    matches : (k, 2) int64 array
+        Rows of both, in the order of the first.
+    nearest : Nearest
+        To go on from with more descriptors.
+    """
+    known = known or Nearest(0, 0)
+    best = known.extended(len(descriptors1), len(descriptors2))
     first, second = descriptors1.astype(np.float32), descriptors2.astype(np.float32)
-    everything = np.arange(len(second))
-    for start in range(0, len(first), _BLOCK_ROWS):
-        block = first[start : start + _BLOCK_ROWS]
-        best.compare(np.arange(start, start + len(block)), everything, block @ second.T)
+    for rows, columns in (
+        (range(known.num1), range(known.num2, len(second))),
+        (range(known.num1, len(first)), range(len(second))),
+    ):
+        others = second[columns.start :].T
+        for start in range(rows.start, rows.stop, _BLOCK_ROWS):
+            block = np.arange(start, min(start + _BLOCK_ROWS, rows.stop))
+            best.compare(block, np.asarray(columns), first[block] @ others)
     matches = best.matches(MAX_RATIO)
     # The other way only for what is left, which is far less.
     products = second[matches[:, 1]] @ first.T
     at = np.arange(len(matches))
     nearest = products[at, matches[:, 0]]
     products[at, matches[:, 0]] = 0.0
-    return matches[_passes(nearest, products.max(axis=1, initial=0.0), MAX_RATIO)]
+    return matches[_passes(nearest, products.max(axis=1, initial=0.0), MAX_RATIO)], best
 
 
 def epipolar_matches(
@@ -83,7 +109,7 @@ def epipolar_matches(
     (k, 2) int64 array
         Rows of both, in the order of the first.
     """
-    best = _Nearest(len(points1), len(points2))
+    best = Nearest(len(points1), len(points2))
     if not len(points1) or not len(points2):
         return best.matches(MAX_EPIPOLAR_RATIO)
     # Coordinates of image 2 of order one, where lines (a, b, c) of a pencil differ by comparable amounts in a, b and c.
@@ -136,7 +162,7 @@ def homography_matches(
     (k, 2) int64 array
         Rows of both, in the order of the first.
     """
-    best = _Nearest(len(points1), len(points2))
+    best = Nearest(len(points1), len(points2))
     taken = _homogeneous(points1) @ H.T
     seen = np.flatnonzero(np.abs(taken[:, 2]) > np.finfo(float).tiny)
     predicted = np.full((len(points1), 2), np.inf)
@@ -160,24 +186,39 @@ def _homogeneous(points: Array) -> Array:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
-class _Nearest:
-    """Products with the nearest and second nearest descriptors of image 1's features, and the nearest of image 2's."""
+class Nearest:
+    """Products with the nearest and second nearest descriptors of image 1's features, and the nearest of image 2's.
+
+    Attributes
+    ----------
+    num1, num2 : int
+        Numbers of features.
+    """
 
     def __init__(self, num1: int, num2: int) -> None:
+        self.num1, self.num2 = num1, num2
         self._nearest = np.zeros(num1, np.int64)
         self._first, self._second = np.zeros(num1, np.float32), np.zeros(num1, np.float32)
         self._first_of_2 = np.zeros(num2, np.float32)
 
+    def extended(self, num1: int, num2: int) -> "Nearest":
+        """The same with more features behind those of both images, which are not compared yet."""
+        more = Nearest(num1, num2)
+        more._nearest[: self.num1], more._first_of_2[: self.num2] = self._nearest, self._first_of_2
+        more._first[: self.num1], more._second[: self.num1] = self._first, self._second
+        return more
+
     def compare(self, rows: IntArray, columns: IntArray, products: Products) -> None:
-        """Record the products (r, c) of features `rows` of image 1 with `columns` of image 2; each row comes once."""
-        if not len(columns):
+        """Record the products (r, c) of features `rows` of image 1 with `columns` of image 2, which come once."""
+        if not len(rows) or not len(columns):
             return
         at, nearest = np.arange(len(rows)), products.argmax(axis=1)
-        self._nearest[rows] = columns[nearest]
-        self._first[rows] = products[at, nearest]
+        first, before = products[at, nearest], self._first[rows]
+        self._nearest[rows] = np.where(first > before, columns[nearest], self._nearest[rows])
         self._first_of_2[columns] = np.maximum(self._first_of_2[columns], products.max(axis=0))
         products[at, nearest] = 0.0
-        self._second[rows] = products.max(axis=1)
+        second = np.maximum(self._second[rows], products.max(axis=1))
+        self._first[rows], self._second[rows] = np.maximum(first, before), np.maximum(second, np.minimum(first, before))
 
     def matches(self, max_ratio: float) -> IntArray:
         """Mutual nearest neighbours that pass the ratio test in image 1."""

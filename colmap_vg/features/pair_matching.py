@@ -12,7 +12,13 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.cameras import is_bent_by_focal
-from colmap_vg.features.nearest_descriptors import epipolar_matches, homography_matches, mutual_matches
+from colmap_vg.features.nearest_descriptors import (
+    Nearest,
+    epipolar_matches,
+    homography_matches,
+    more_mutual_matches,
+    mutual_matches,
+)
 from colmap_vg.features.orientation_votes import excess_over_chance, log2_scales, num_agreeing, orientations
 from colmap_vg.two_view.sampson_errors import pixel_sampson_errors
 
@@ -96,31 +102,38 @@ def match_pair(first: ImageFeatures, second: ImageFeatures, options: pycolmap.Tw
     PairMatches
         Matches of the largest features, and those found where their geometry predicts them.
     """
+    nearest: Nearest | None = None
     if min(len(first.largest), len(second.largest)) > NUM_TRIED_FEATURES and first.has_more and second.has_more:
         few = [replace(image, largest=image.largest[:NUM_TRIED_FEATURES]) for image in (first, second)]
         many = pycolmap.TwoViewGeometryOptions(**options.todict(recursive=False))
         many.min_num_inliers = max(options.min_num_inliers, MIN_TRIED_INLIERS)
-        found = _match_largest(few[0], few[1], many)
+        found, nearest = _match_largest(few[0], few[1], many)
         if len(found.geometry.inlier_matches):
             return _match_others(few[0], few[1], found, options)
         if agreement(first, second, found.matches)[1] < MIN_TRIED_EXCESS:
             return found
-    found = _match_largest(first, second, options)
+    found, _ = _match_largest(first, second, options, nearest)
     if len(found.geometry.inlier_matches) and (first.has_more or second.has_more):
         return _match_others(first, second, found, options)
     return found
 
 
 def _match_largest(
-    first: ImageFeatures, second: ImageFeatures, options: pycolmap.TwoViewGeometryOptions
-) -> PairMatches:
-    """Match the largest features by brute force, and verify them where they agree on a rotation and a scale."""
-    rows = mutual_matches(first.descriptors[first.largest], second.descriptors[second.largest])
+    first: ImageFeatures,
+    second: ImageFeatures,
+    options: pycolmap.TwoViewGeometryOptions,
+    known: Nearest | None = None,
+) -> tuple[PairMatches, Nearest]:
+    """Match the largest features by brute force, and verify them where they agree on a rotation and a scale.
+
+    Also return the nearest neighbours, to go on from with more features.
+    """
+    rows, nearest = more_mutual_matches(first.descriptors[first.largest], second.descriptors[second.largest], known)
     matches = np.stack([first.largest[rows[:, 0]], second.largest[rows[:, 1]]], axis=1)
     agreeing, excess = agreement(first, second, matches)
     if agreeing < MIN_CONSISTENT or excess == 0.0:
-        return PairMatches(matches, pycolmap.TwoViewGeometry())
-    return PairMatches(matches, _verified(first, second, matches, options))
+        return PairMatches(matches, pycolmap.TwoViewGeometry()), nearest
+    return PairMatches(matches, _verified(first, second, matches, options)), nearest
 
 
 def _match_others(

@@ -11,8 +11,10 @@ from colmap_vg.features.nearest_descriptors import (
     MAX_RATIO,
     MAX_SQUARED_DISTANCE,
     MAX_WINDOW_RATIO,
+    Nearest,
     epipolar_matches,
     homography_matches,
+    more_mutual_matches,
     mutual_matches,
 )
 
@@ -60,6 +62,27 @@ def test_mutual_matches_are_those_of_brute_force(seed: int) -> None:
     assert found == expected
     assert 300 < len(found) < 420
     assert {(b, a) for a, b in mutual_matches(second, first).tolist()} == found
+
+
+@pytest.mark.parametrize(("leading1", "leading2"), [(0, 0), (7, 300), (300, 7), (450, 500)])
+def test_matching_goes_on_from_the_leading_descriptors(
+    leading1: int, leading2: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = similar_sets(5)
+    at_once, every = more_mutual_matches(first, second, None)
+    _, known = more_mutual_matches(first[:leading1], second[:leading2], None)
+    compare, counted = Nearest.compare, []
+
+    def counting(best: Nearest, rows: np.ndarray, columns: np.ndarray, products: np.ndarray) -> None:
+        counted.append(products.size)
+        compare(best, rows, columns, products)
+
+    monkeypatch.setattr(Nearest, "compare", counting)
+    matches, nearest = more_mutual_matches(first, second, known)
+    np.testing.assert_array_equal(matches, at_once)
+    for name in ("_nearest", "_first", "_second", "_first_of_2"):
+        np.testing.assert_array_equal(getattr(nearest, name), getattr(every, name))
+    assert sum(counted) == len(first) * len(second) - leading1 * leading2
 
 
 @pytest.mark.parametrize("inside", [False, True], ids=["epipole outside", "epipole inside"])
@@ -110,13 +133,13 @@ def test_homography_matches_are_those_of_brute_force_near_predicted_places() -> 
 
 def compared_share(monkeypatch: pytest.MonkeyPatch, num1: int, num2: int) -> Callable[[], float]:
     """Share of the pairs of features whose descriptors have been compared."""
-    compare, sizes = nearest_descriptors._Nearest.compare, []
+    compare, sizes = nearest_descriptors.Nearest.compare, []
 
     def counted(self: object, rows: np.ndarray, columns: np.ndarray, products: np.ndarray) -> None:
         sizes.append(products.size)
         compare(self, rows, columns, products)
 
-    monkeypatch.setattr(nearest_descriptors._Nearest, "compare", counted)
+    monkeypatch.setattr(nearest_descriptors.Nearest, "compare", counted)
     return lambda: sum(sizes) / (num1 * num2)
 
 

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from colmap_vg.features import pair_matching
-from colmap_vg.features.nearest_descriptors import epipolar_matches, homography_matches
+from colmap_vg.features.nearest_descriptors import Nearest, epipolar_matches, homography_matches
 from colmap_vg.features.pair_matching import (
     MAX_EPIPOLAR_ERROR_PX,
     MAX_SHIFT,
@@ -131,13 +131,14 @@ def with_first(scene: Pair, count: int) -> Pair:
 
 
 def test_few_features_are_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    compared, nearest = [], pair_matching.mutual_matches
+    compared, mutual_matches = [], pair_matching.more_mutual_matches
 
-    def mutual_matches(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    def counted(one: np.ndarray, other: np.ndarray, known: Nearest | None) -> tuple[np.ndarray, Nearest]:
         compared.append((len(one), len(other)))
-        return nearest(one, other)
+        assert (known is None) == (len(compared) == 1)
+        return mutual_matches(one, other, known)
 
-    monkeypatch.setattr(pair_matching, "mutual_matches", mutual_matches)
+    monkeypatch.setattr(pair_matching, "more_mutual_matches", counted)
     monkeypatch.setattr(pair_matching, "NUM_TRIED_FEATURES", 200)
     scene = pair(0, lens=camera())
     found = with_first(scene, 1000).matched()
