@@ -18,7 +18,7 @@ from colmap_vg.errors import DataFileError
 from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
 from colmap_vg.jobs.mapper import map_database
-from colmap_vg.mapping import extension
+from colmap_vg.mapping import build, extension
 from colmap_vg.mapping.build import finish_registration
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.views import FOCAL_PX, HEIGHT, WIDTH, SyntheticViews, synthetic_views
@@ -118,15 +118,21 @@ def test_images_with_many_points_are_registered_by_a_sample(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(extension, "NUM_OBSERVATIONS_TO_REGISTER", 60)
-    given: list[int] = []
+    given, left, register = list[int](), list[set[int]](), build.register_left_out
+
+    def register_left_out(*arguments: object) -> set[int]:
+        left.append(register(*arguments))
+        return left[-1]
 
     def finish(mapper, options, log, pairs, held, kept, placed):
         given.extend(sorted(placed))
         return finish_registration(mapper, options, log, pairs, held, kept, placed)
 
     monkeypatch.setattr(extension, "finish_registration", finish)
+    monkeypatch.setattr(build, "register_left_out", register_left_out)
     models = view_graph_mapping(scene / "all.db", None, tmp_path / "out", OPTIONS, input_path=scene / "old" / "0")
     assert given == list(NEW)
+    assert left == [set(), set()]
     joint = pycolmap.Reconstruction(scene / "joint" / "0")
     names = sorted(poses(joint))
     distances, _ = align_positions(centers(models[0], names), centers(joint, names))
@@ -139,6 +145,47 @@ def test_a_model_is_part_of_another_by_ids_names_and_keypoints(scene: Path) -> N
     assert not extension._is_part_of(joint, old)
     old.image(1).name = "other.jpg"
     assert not extension._is_part_of(old, joint)
+
+
+@pytest.mark.parametrize("num_cameras", [1, 2])
+def test_a_sample_of_points_tells_poses_and_calibrations_of_new_rigs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_cameras: int
+) -> None:
+    monkeypatch.setattr(extension, "NUM_OBSERVATIONS_TO_REGISTER", 100)
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=2, num_cameras_per_rig=num_cameras, num_frames_per_rig=6, num_points3D=300
+    )
+    options.camera_has_prior_focal_length = False
+    with pycolmap.Database.open(tmp_path / "all.db") as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+    model, new = pycolmap.Reconstruction(truth), list(range(7, 13))
+    for frame_id in new:
+        model.deregister_frame(frame_id)
+    if num_cameras == 1:
+        model.camera(2).params = (model.camera(2).params * [1.1, 1.0, 1.0, 1.0]).tolist()
+    found = extension._registered_by_sample(cache, model, OPTIONS)
+    assert sorted(found) == new
+    for frame_id, pose in found.items():
+        np.testing.assert_allclose(pose.matrix(), truth.frame(frame_id).rig_from_world.matrix(), atol=1e-4)
+    assert model.num_reg_frames() == 6
+    for camera_id, camera in truth.cameras.items():
+        np.testing.assert_allclose(model.camera(camera_id).params, camera.params, rtol=1e-4)
+
+
+def test_rigs_of_other_reference_sensors_differ() -> None:
+    def of_rig(reference: int, other: int) -> pycolmap.Reconstruction:
+        model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
+        for camera_id in (1, 2):
+            model.add_camera(pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_PINHOLE", 500.0, 640, 480))
+        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, reference))
+        rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, other), None)
+        model.add_rig(rig)
+        return model
+
+    models = [of_rig(1, 2), of_rig(2, 1)]
+    assert [extension._is_part_of(a, b) for a in models for b in models] == [True, False, False, True]
 
 
 def test_a_model_with_other_rigs_is_no_part_of_another() -> None:

@@ -48,6 +48,20 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
     assert triangulator_options(options).random_seed == 7
 
 
+def test_images_without_enough_observations_are_removed() -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=6, num_points3D=100))
+    manager = pycolmap.ObservationManager(model)
+    seen = [place for place in range(model.image(3).num_points2D()) if model.image(3).point2D(place).has_point3D()]
+    for place in seen[build.MIN_SUPPORTED_OBSERVATIONS - 1 :]:
+        manager.delete_observation(3, place)
+    mapper = Mock(reconstruction=model, observation_manager=manager)
+    assert build._remove_unsupported(mapper, frozenset({model.image(3).frame_id})) == set()
+    assert build._remove_unsupported(mapper) == {3}
+    assert not model.image(3).has_pose
+    assert model.num_reg_images() == 11
+
+
 @pytest.mark.parametrize(
     ("ratios", "growth", "rounds"),
     [
