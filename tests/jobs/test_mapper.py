@@ -339,22 +339,20 @@ def test_library_calls_are_quiet_and_leave_the_log_s_level(
 def test_separate_lenses_are_tried_briefly_and_adjusted_to_the_end_where_they_are_better(
     ratio: float, trials: list[bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, models = [], []
+    asked, tried, separated = [], [], pycolmap.Reconstruction()
     ratios = iter([ratio, 0.5 * mapper.CONVERGED_COST_RATIO, 1.0])
 
     def adjusted(_: object, model: pycolmap.Reconstruction, *__: object, rough: bool = False) -> float:
-        assert model is models[0]
+        assert model is not separated
+        tried.append(model)
         asked.append(rough)
         return next(ratios)
 
-    def separate(*_: object) -> pycolmap.Reconstruction:
-        models.append(pycolmap.Reconstruction())
-        return models[-1]
-
     monkeypatch.setattr(mapper, "adjust_once_more", adjusted)
-    monkeypatch.setattr(mapper, "with_database_cameras", separate)
+    monkeypatch.setattr(mapper, "with_database_cameras", lambda *_: separated)
     log = StageLog()
     with log.stage("lenses"):
         result = mapper._with_database_cameras(None, pycolmap.Reconstruction(), {}, ONE_THREAD, log)
     assert asked == trials
-    assert result is models[0 if ratio < mapper.SHARED_LENS_COST_RATIO else 1]
+    assert all(model is tried[0] for model in tried)
+    assert result is (tried[0] if ratio < mapper.SHARED_LENS_COST_RATIO else separated)
