@@ -107,12 +107,12 @@ def match_pair(first: ImageFeatures, second: ImageFeatures, options: pycolmap.Tw
         few = [replace(image, largest=image.largest[:NUM_TRIED_FEATURES]) for image in (first, second)]
         many = pycolmap.TwoViewGeometryOptions(**options.todict(recursive=False))
         many.min_num_inliers = max(options.min_num_inliers, MIN_TRIED_INLIERS)
-        found, nearest = _match_largest(few[0], few[1], many)
+        found, excess, nearest = _match_largest(few[0], few[1], many)
         if len(found.geometry.inlier_matches):
             return _match_others(few[0], few[1], found, options)
-        if agreement(first, second, found.matches)[1] < MIN_TRIED_EXCESS:
+        if excess < MIN_TRIED_EXCESS:
             return found
-    found, _ = _match_largest(first, second, options, nearest)
+    found, _, _ = _match_largest(first, second, options, nearest)
     if len(found.geometry.inlier_matches) and (first.has_more or second.has_more):
         return _match_others(first, second, found, options)
     return found
@@ -123,17 +123,17 @@ def _match_largest(
     second: ImageFeatures,
     options: pycolmap.TwoViewGeometryOptions,
     known: Nearest | None = None,
-) -> tuple[PairMatches, Nearest]:
+) -> tuple[PairMatches, float, Nearest]:
     """Match the largest features by brute force, and verify them where they agree on a rotation and a scale.
 
-    Also return the nearest neighbours, to go on from with more features.
+    Also return how many more agree than by chance, and the nearest neighbours, to go on from with more features.
     """
     rows, nearest = more_mutual_matches(first.descriptors[first.largest], second.descriptors[second.largest], known)
     matches = np.stack([first.largest[rows[:, 0]], second.largest[rows[:, 1]]], axis=1)
     agreeing, excess = agreement(first, second, matches)
     if agreeing < MIN_CONSISTENT or excess == 0.0:
-        return PairMatches(matches, pycolmap.TwoViewGeometry()), nearest
-    return PairMatches(matches, _verified(first, second, matches, options)), nearest
+        return PairMatches(matches, pycolmap.TwoViewGeometry()), excess, nearest
+    return PairMatches(matches, _verified(first, second, matches, options)), excess, nearest
 
 
 def _match_others(

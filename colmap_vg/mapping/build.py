@@ -165,7 +165,7 @@ def finish_registration(
     with log.stage("register"):
         found = _register_placed(mapper, options, placed or {})
         while True:
-            found |= register_left_out(mapper, options, frozenset(misplaced))
+            found |= _register_left_out(mapper, options, frozenset(misplaced))
             wrong = _remove_misplaced(mapper, found, pairs)
             misplaced, found = misplaced | wrong, found - wrong
             if not found:
@@ -209,7 +209,7 @@ def _register_remaining(
     """Deregister images without support and register images by their points; return the ids of the misplaced ones."""
     removed = _remove_unsupported(mapper)
     # A removed image may be registered again by its points: its pose from the view graph was wrong.
-    added = register_left_out(mapper, options, others)
+    added = _register_left_out(mapper, options, others)
     removed -= added
     misplaced = _remove_misplaced(mapper, added, pairs)
     added -= misplaced
@@ -307,18 +307,10 @@ def _remove_unsupported(mapper: "pycolmap.IncrementalMapper", kept_frames: froze
         mapper.observation_manager.deregister_frame(frame_id)
 
 
-def register_left_out(
-    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, never: frozenset[int] = frozenset()
+def _register_left_out(
+    mapper: "pycolmap.IncrementalMapper", options: MappingOptions, never: frozenset[int]
 ) -> set[int]:
-    """Register images by PnP against the points, best first, until none can be added; return their ids.
-
-    Parameters
-    ----------
-    mapper : pycolmap.IncrementalMapper
-    options : MappingOptions
-    never : frozenset of int, optional
-        Ids of images that are not registered.
-    """
+    """Register images by PnP against the points, best first, until none can be added; return their ids."""
     registration, triangulator = mapper_options(options), triangulator_options(options)
     added: set[int] = set()
     while True:

@@ -182,7 +182,7 @@ def _is_part_of(given: "pycolmap.Reconstruction", whole: "pycolmap.Reconstructio
         for frame_id, frame in given.frames.items()
     )
     return frames and all(
-        whole.exists_rig(rig_id) and _sensors(rig) == _sensors(whole.rig(rig_id)) for rig_id, rig in given.rigs.items()
+        whole.exists_rig(rig_id) and _has_places_of(rig, whole.rig(rig_id)) for rig_id, rig in given.rigs.items()
     )
 
 
@@ -190,8 +190,12 @@ def _contents(frame: "pycolmap.Frame") -> tuple[int, list[int]]:
     return frame.rig_id, sorted(data.id for data in frame.image_ids)
 
 
-def _sensors(rig: "pycolmap.Rig") -> tuple[int, list[int]]:
-    return rig.ref_sensor_id.id, sorted(sensor.id for sensor in rig.non_ref_sensors)
+def _has_places_of(given: "pycolmap.Rig", own: "pycolmap.Rig") -> bool:
+    """Whether a rig has the sensors of the database's, and their places where that knows them."""
+    ids = [(rig.ref_sensor_id.id, sorted(sensor.id for sensor in rig.non_ref_sensors)) for rig in (given, own)]
+    return ids[0] == ids[1] and all(
+        given.has_sensor_from_rig(sensor) or not own.has_sensor_from_rig(sensor) for sensor in own.non_ref_sensors
+    )
 
 
 def _same_keypoints(one: "pycolmap.Image", other: "pycolmap.Image") -> bool:

@@ -118,7 +118,7 @@ def test_images_with_many_points_are_registered_by_a_sample(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(extension, "NUM_OBSERVATIONS_TO_REGISTER", 60)
-    given, left, register = list[int](), list[set[int]](), build.register_left_out
+    given, left, register = list[int](), list[set[int]](), build._register_left_out
 
     def register_left_out(*arguments: object) -> set[int]:
         left.append(register(*arguments))
@@ -129,7 +129,7 @@ def test_images_with_many_points_are_registered_by_a_sample(
         return finish_registration(mapper, options, log, pairs, held, kept, placed)
 
     monkeypatch.setattr(extension, "finish_registration", finish)
-    monkeypatch.setattr(build, "register_left_out", register_left_out)
+    monkeypatch.setattr(build, "_register_left_out", register_left_out)
     models = view_graph_mapping(scene / "all.db", None, tmp_path / "out", OPTIONS, input_path=scene / "old" / "0")
     assert given == list(NEW)
     assert left == [set(), set()]
@@ -174,18 +174,21 @@ def test_a_sample_of_points_tells_poses_and_calibrations_of_new_rigs(
         np.testing.assert_allclose(model.camera(camera_id).params, camera.params, rtol=1e-4)
 
 
-def test_rigs_of_other_reference_sensors_differ() -> None:
-    def of_rig(reference: int, other: int) -> pycolmap.Reconstruction:
+def test_rigs_of_other_reference_sensors_or_unknown_places_differ() -> None:
+    def of_rig(reference: int, other: int, place: pycolmap.Rigid3d | None = None) -> pycolmap.Reconstruction:
         model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
         for camera_id in (1, 2):
             model.add_camera(pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_PINHOLE", 500.0, 640, 480))
         rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, reference))
-        rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, other), None)
+        rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, other), place)
         model.add_rig(rig)
         return model
 
     models = [of_rig(1, 2), of_rig(2, 1)]
     assert [extension._is_part_of(a, b) for a in models for b in models] == [True, False, False, True]
+    known = of_rig(1, 2, pycolmap.Rigid3d())
+    assert extension._is_part_of(known, models[0])
+    assert not extension._is_part_of(models[0], known)
 
 
 def test_a_model_with_other_rigs_is_no_part_of_another() -> None:

@@ -1,5 +1,6 @@
 """The options of building a model that reach pycolmap, and when its rounds of adjustment end."""
 
+from pathlib import Path
 from unittest.mock import Mock
 
 import pycolmap
@@ -46,6 +47,26 @@ def test_switches_threads_and_seed_reach_pycolmap(switch: bool) -> None:
     assert (mapper.abs_pose_refine_focal_length, mapper.abs_pose_refine_extra_params) == (switch, switch)
     assert (mapper.num_threads, mapper.random_seed) == (3, 7)
     assert triangulator_options(options).random_seed == 7
+
+
+def test_tracks_that_a_new_image_lengthens_are_completed(tmp_path: Path) -> None:
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=6, num_points3D=40)
+    with pycolmap.Database.open(tmp_path / "all.db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+    pose = model.frame(3).rig_from_world
+    model.deregister_frame(3)
+    for place in range(model.image(5).num_points2D()):
+        if model.image(5).point2D(place).has_point3D():
+            model.delete_observation(5, place)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    assert build._register_placed(mapper, MappingOptions(), {3: pose}) == {3}
+    assert (model.image(3).num_points3D, model.image(5).num_points3D) == (40, 0)
+    build._complete_new_tracks(mapper, MappingOptions())
+    assert model.image(5).num_points3D == 40
+    mapper.end_reconstruction(False)
 
 
 def test_images_without_enough_observations_are_removed() -> None:

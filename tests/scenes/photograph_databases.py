@@ -18,30 +18,7 @@ def extract_and_match(
     options: FeatureOptions | None = None,
     log: StageLog | None = None,
 ) -> FeatureResult:
-    """Make a database of features and verified matches from a folder of photographs.
-
-    What the database already holds is kept: an interrupted job goes on where it stopped.
-
-    Parameters
-    ----------
-    image_path : path
-        Folder of photographs, searched recursively.
-    database_path : path
-        Created when missing.
-    options : FeatureOptions, optional
-    log : StageLog, optional
-
-    Returns
-    -------
-    FeatureResult
-
-    Raises
-    ------
-    ImageFolderError
-        The folder is missing, or holds fewer than three photographs that can be used.
-    OptionError
-        The camera model is unknown, or does not take so many parameters.
-    """
+    """Extract and match the features of a folder of photographs, where neither process nor record is asked for."""
     options, log = with_rig_cameras(FeatureOptions.given(options)), log or StageLog()
     photographs, skipped = check_photographs(image_path, options, log)
     names = [photograph.name for photograph in photographs]
