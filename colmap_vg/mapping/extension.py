@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 NUM_COMPARED, SAME_KEYPOINT_PX = 20, 0.01
 """Number of keypoints of each image that are compared, and maximum distance between those that are the same, pixels."""
-NUM_OBSERVATIONS_TO_REGISTER = 500
+NUM_OBSERVATIONS_TO_REGISTER = 250
 """Observations of an image that suffice to register it before bundle adjustment."""
 
 

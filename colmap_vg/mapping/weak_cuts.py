@@ -217,7 +217,7 @@ def _expected(reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, co
     alike &= np.abs(np.log(distance[sight] / distance[near])) <= np.log(MAX_DISTANCE_RATIO)
     alike &= ~flat[point[sight]] | (np.abs(facing[sight] / facing[near] - 1.0) <= MAX_FORESHORTENING)
     sight, near = sight[alike], near[alike]
-    parallel = np.einsum("ka,ka->k", rays[sight], rays[near]) >= np.cos(np.radians(NEAR_DEG))
+    parallel = sum(ray[sight] * ray[near] for ray in rays.T.copy()) >= np.cos(np.radians(NEAR_DEG))
     sight, near = sight[parallel], near[parallel]
     return _Expected(point[sight], image[sight], image[near], seen[sight])
 
@@ -226,5 +226,5 @@ def _normals(every: Array, points: Array) -> tuple[Array, BoolArray]:
     """Normals (k, 3), of either sign, of the surface through points (k, 3) and their neighbours, and if it is flat."""
     neighbors = every[cKDTree(every).query(points, min(NUM_NEIGHBORS, len(every)))[1]].reshape(len(points), -1, 3)
     deviations = neighbors - neighbors.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("kna,knb->kab", deviations, deviations))
+    values, vectors = np.linalg.eigh(np.swapaxes(deviations, 1, 2) @ deviations)
     return vectors[:, :, 0], np.asarray(values[:, 0] <= MAX_FLATNESS * values[:, 1])
