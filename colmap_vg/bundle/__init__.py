@@ -1,1 +1,1 @@
-"""Bundle adjustment: poses, lenses and points that fit the keypoints best."""
+"""Triangulation and bundle adjustment: poses, lenses and points that fit the keypoints best."""

@@ -1,5 +1,6 @@
 """The 3 x 3 normal equations of all points, factored by Cholesky at once, component by component."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,10 +57,13 @@ def factored(num_points: int, point_row: IntArray, by_point: Array) -> PointFact
     by_point : (2, 3, k) array
         Derivative A of each weighted residual by its point.
     """
-    xx, xy, xz, yy, yz, zz = (
-        np.bincount(point_row, np.einsum("ak,ak->k", by_point[:, i], by_point[:, j]), minlength=num_points)
-        for i, j in _COMPONENTS
-    )
+    products = (np.einsum("ak,ak->k", by_point[:, i], by_point[:, j]) for i, j in _COMPONENTS)
+    return cholesky(sums_at_points(num_points, point_row, products))
+
+
+def cholesky(components: Array) -> PointFactors:
+    """Factor symmetric 3 x 3 matrices, given by the entries of their lower triangles, column by column: (6, q)."""
+    xx, xy, xz, yy, yz, zz = components
     tiny = np.finfo(np.float64).tiny
     level = DAMPING * (xx + yy + zz) + tiny
     a = np.sqrt(xx + level)
@@ -72,9 +76,10 @@ def factored(num_points: int, point_row: IntArray, by_point: Array) -> PointFact
 
 def gradients(num_points: int, point_row: IntArray, by_point: Array, residuals: Array) -> Array:
     """Gradients (3, q) of the cost by points, for derivatives (2, 3, k) and residuals (2, k)."""
-    return np.stack(
-        [
-            np.bincount(point_row, np.einsum("ak,ak->k", by_point[:, axis], residuals), minlength=num_points)
-            for axis in range(3)
-        ]
-    )
+    products = (np.einsum("ak,ak->k", by_point[:, axis], residuals) for axis in range(3))
+    return sums_at_points(num_points, point_row, products)
+
+
+def sums_at_points(num_points: int, point_row: IntArray, values: Iterable[Array]) -> Array:
+    """Sums (c, q) of c values of each observation (k,) over those of each point."""
+    return np.array([np.bincount(point_row, row, num_points) for row in values], dtype=np.float64)

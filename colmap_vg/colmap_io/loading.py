@@ -1,4 +1,4 @@
-"""Load a database's cameras, rigs, frames and images into a `pycolmap.Reconstruction` without poses."""
+"""Load a database's cameras, rigs, frames and images into a `pycolmap.Reconstruction`."""
 
 import pycolmap
 
@@ -21,3 +21,25 @@ def loaded_reconstruction(cache: "pycolmap.DatabaseCache") -> "pycolmap.Reconstr
             f"the database's rigs and frames contradict its images ({error}); extract the features again"
         ) from error
     return reconstruction
+
+
+def with_other_images(model: "pycolmap.Reconstruction", cache: "pycolmap.DatabaseCache") -> None:
+    """Add to a model what only the database holds, in place; what the model holds stays.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        All that it holds has the ids of the database.
+    cache : pycolmap.DatabaseCache
+    """
+    own = {}
+    # COLMAP refuses to load cameras over those of another camera model.
+    for camera_id, camera in model.cameras.items():
+        if cache.exists_camera(camera_id):
+            own[camera_id] = camera.model, camera.params.tolist()
+            camera.model, camera.params = cache.camera(camera_id).model, cache.camera(camera_id).params.tolist()
+    model.load(cache)
+    for camera_id, (camera_model, params) in own.items():
+        camera = model.camera(camera_id)
+        camera.model, camera.params = camera_model, params
+        camera.has_prior_focal_length = cache.camera(camera_id).has_prior_focal_length  # is not in COLMAP's files

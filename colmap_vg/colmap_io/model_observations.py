@@ -60,17 +60,7 @@ class ModelObservations:
             reconstruction.write_binary(folder)
             content = (Path(folder) / "images.bin").read_bytes()
             points = (Path(folder) / "points3D.bin").read_bytes()
-        found, place = {}, 8
-        _check_room(len(content) >= place)
-        for _ in range(int.from_bytes(content[:8], "little")):
-            image_id = int.from_bytes(content[place : place + 4], "little")
-            place = content.find(b"\0", place + _POSE_AND_CAMERA) + 1
-            _check_room(place > 0)
-            count = int.from_bytes(content[place : place + 8], "little")
-            _check_room(place + 8 + count * _KEYPOINT.itemsize <= len(content))
-            keypoints = np.frombuffer(content, _KEYPOINT, count, place + 8)
-            found[image_id] = keypoints[keypoints["point_id"] != _NO_POINT]
-            place += 8 + count * _KEYPOINT.itemsize
+        found = {i: own[own["point_id"] != _NO_POINT] for i, own in keypoint_records(content).items()}
         rows = np.concatenate([found[image_id] for image_id in sorted(found)] or [np.empty(0, _KEYPOINT)])
         every_point, positions = _points(points, *np.unique(rows["point_id"], return_counts=True))
         return cls(
@@ -92,6 +82,37 @@ class ModelObservations:
     def positions_of(self, point_ids: IntArray) -> Array:
         """Positions (n, 3) of some points of the model."""
         return np.asarray(self.positions[np.searchsorted(self.every_point, point_ids)])
+
+
+def keypoint_records(content: bytes | bytearray) -> dict[int, NDArray[np.void]]:
+    """Find the keypoints of each image in COLMAP's binary file of images.
+
+    Parameters
+    ----------
+    content : bytes or bytearray
+        The file.
+
+    Returns
+    -------
+    dict of int to (k,) array of records
+        For each image id `xy`, pixels, and `point_id`. They can be changed within a bytearray.
+
+    Raises
+    ------
+    OutputError
+        The file is cut short, since the temporary folder has no room for the model.
+    """
+    found, place = {}, 8
+    _check_room(len(content) >= place)
+    for _ in range(int.from_bytes(content[:8], "little")):
+        image_id = int.from_bytes(content[place : place + 4], "little")
+        place = content.find(b"\0", place + _POSE_AND_CAMERA) + 1
+        _check_room(place > 0)
+        count = int.from_bytes(content[place : place + 8], "little")
+        _check_room(place + 8 + count * _KEYPOINT.itemsize <= len(content))
+        found[image_id] = np.frombuffer(content, _KEYPOINT, count, place + 8)
+        place += 8 + count * _KEYPOINT.itemsize
+    return found
 
 
 def _points(content: bytes, observed: NDArray[np.uint64], counts: IntArray) -> tuple[IntArray, Array]:

@@ -59,7 +59,7 @@ def join_models(
         elsewhere = frozenset(
             i for k, m in enumerate(models) if k not in (first, second) for i in m.reconstruction.reg_image_ids()
         )
-        result = build_model(cache, posed, options, log, elsewhere, pairs)
+        posed, result = build_model(cache, posed, options, log, elsewhere, pairs)
         cut = cut_along(posed, pairs, compared, moved)
         if both <= set(posed.reg_image_ids()) and not result.folded and not cut.contradicted:
             rest = [model for k, model in enumerate(models) if k not in (first, second)]

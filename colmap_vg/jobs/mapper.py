@@ -246,9 +246,9 @@ def _build(
             log.result(f"{len(replaced) + len(set(replaced.values()))} cameras share calibrations")
     models: list[BuiltModel] = []
     pairs = _pair_rotations(graph)
-    for component, reconstruction in enumerate(posed):
+    for component, of_poses in enumerate(posed):
         others = frozenset(solution.image_ids[~np.isin(solution.component, (-1, component))].tolist())
-        result = build_model(cache, reconstruction, options, log, others, pairs)
+        reconstruction, result = build_model(cache, of_poses, options, log, others, pairs)
         if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() > 0:
             models.append(BuiltModel(reconstruction, result))
         elif len(posed) > 1:

@@ -1,1 +1,1 @@
-"""Triangulation, bundle adjustment and registration, by pycolmap."""
+"""Triangulation, bundle adjustment and registration of a COLMAP model."""

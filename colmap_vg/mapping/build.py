@@ -1,7 +1,7 @@
 """Build a model from given poses: triangulation, robust bundle adjustment, registration of the remaining images.
 
-pycolmap does the heavy work. The given poses are nearly right, so one short round of bundle adjustment suffices where
-a mapper that starts from rough poses needs many.
+pycolmap completes tracks, filters points and registers images. The given poses are nearly right, so one short round of
+bundle adjustment suffices where a mapper that starts from rough poses needs many.
 """
 
 from collections import Counter
@@ -23,6 +23,7 @@ from colmap_vg.mapping.options import (
     triangulator_options,
 )
 from colmap_vg.mapping.pair_agreement import PairRotations, pair_agreement
+from colmap_vg.mapping.points import with_triangulated_points
 from colmap_vg.mapping.snapshot import TRADING_OFF
 from colmap_vg.mapping.support import is_supported, supported_observations
 from colmap_vg.options import MappingOptions
@@ -68,8 +69,8 @@ def build_model(
     log: StageLog,
     others: frozenset[int] = frozenset(),
     pairs: PairRotations | None = None,
-) -> BuildResult:
-    """Triangulate and adjust a reconstruction of poses, in place, and register the remaining images.
+) -> tuple["pycolmap.Reconstruction", BuildResult]:
+    """Triangulate and adjust a reconstruction of poses, and register the remaining images.
 
     Parameters
     ----------
@@ -86,14 +87,15 @@ def build_model(
 
     Returns
     -------
-    BuildResult
+    reconstruction : pycolmap.Reconstruction
+    result : BuildResult
     """
     if options.ba_refine_extra_params:
         bend_undistorted_fov(reconstruction)
+    reconstruction = triangulated(cache, reconstruction, log)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
     held = held_of(cache)
-    triangulate_registered(mapper, options, log)
     with log.stage("adjust"):
         if not _adjust_to_convergence(mapper, options, held):
             log.warn(f"Bundle adjustment did not converge in {MAX_NUM_ROUNDS} rounds; the model may be bent.")
@@ -112,19 +114,17 @@ def build_model(
         folded = _warn_of_folds(reconstruction, pairs, log)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
-    return BuildResult(frozenset(misplaced), folded)
+    return reconstruction, BuildResult(frozenset(misplaced), folded)
 
 
-def triangulate_registered(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, log: StageLog) -> None:
-    """Triangulate the points of all registered images, as a stage."""
-    triangulator = triangulator_options(options)
+def triangulated(
+    cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", log: StageLog
+) -> "pycolmap.Reconstruction":
+    """Copy a model of poses with the points of its registered images, as a stage."""
     with log.stage("triangulate"):
-        image_ids = sorted(mapper.reconstruction.reg_image_ids())
-        for count, image_id in enumerate(image_ids, start=1):
-            mapper.triangulate_image(triangulator, image_id)
-            log.progress(f"{count} of {len(image_ids)} images", count / len(image_ids), count)
-        mapper.complete_and_merge_tracks(triangulator)
-        log.result(f"{mapper.reconstruction.num_points3D()} points")
+        model = with_triangulated_points(cache, reconstruction)
+        log.result(f"{model.num_points3D()} points")
+    return model
 
 
 def settle_given_poses(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, held: Held) -> None:

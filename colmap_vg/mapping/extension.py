@@ -8,16 +8,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_vg.colmap_io.loading import loaded_reconstruction
+from colmap_vg.colmap_io.loading import loaded_reconstruction, with_other_images
 from colmap_vg.errors import DataFileError
 from colmap_vg.events import StageLog
 from colmap_vg.geometry.similarity import align_positions
-from colmap_vg.mapping.build import (
-    BuildResult,
-    finish_registration,
-    settle_given_poses,
-    triangulate_registered,
-)
+from colmap_vg.mapping.build import BuildResult, finish_registration, settle_given_poses, triangulated
 from colmap_vg.mapping.bundle import held_of
 from colmap_vg.mapping.options import mapper_options
 from colmap_vg.mapping.pair_agreement import PairRotations
@@ -108,7 +103,7 @@ def extend_model(
         old = {image_id: ids[given.image(image_id).name] for image_id in sorted(given.reg_image_ids())}
         if _is_part_of(given, model):
             model = pycolmap.Reconstruction(given)
-            model.load(cache)
+            with_other_images(model, cache)
             copied = model.num_points3D()
         else:
             _copy_cameras(given, model, old, log)
@@ -116,13 +111,14 @@ def extend_model(
             copied = _copy_points(given, model, old)
         log.result(f"{len(old)} images and {copied} points of the given model")
         placed = _registered_by_sample(cache, model, options)
+    if copied == 0:
+        model = triangulated(cache, model, log)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     frames = {model.image(image_id).frame_id for image_id in old.values()}
     # Images of given frames would move with the places of their sensors.
     held = held_of(model, frozenset(frames)) if options.fix_existing_frames else held_of(cache)
     if copied == 0:
-        triangulate_registered(mapper, options, log)
         settle_given_poses(mapper, options, held)
     result = finish_registration(mapper, options, log, pairs, held, frozenset(frames), placed)
     mapper.end_reconstruction(False)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.mapping.options import MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG, triangulator_options
+from colmap_vg.mapping.points import with_triangulated_points
 from colmap_vg.mapping.visibility import NEAR_DEG, in_frame, sampled_tracks
 from colmap_vg.options import MappingOptions
 
@@ -53,7 +54,7 @@ class PointEvidence:
 def point_evidence(
     cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", options: MappingOptions
 ) -> PointEvidence:
-    """Triangulate a reconstruction of poses, in place, and count its expected and existing observations.
+    """Triangulate a reconstruction of poses and count its expected and existing observations.
 
     Parameters
     ----------
@@ -66,11 +67,10 @@ def point_evidence(
     -------
     PointEvidence
     """
+    reconstruction = with_triangulated_points(cache, reconstruction)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
     triangulator = triangulator_options(options)
-    for image_id in sorted(reconstruction.reg_image_ids()):
-        mapper.triangulate_image(triangulator, image_id)
     mapper.complete_and_merge_tracks(triangulator)
     mapper.observation_manager.filter_observations_with_negative_depth()
     mapper.observation_manager.filter_all_points3D(MAX_REPROJECTION_PX, MIN_TRIANGULATION_ANGLE_DEG)

@@ -13,6 +13,7 @@ from colmap_vg.colmap_io.reconstruction import loaded_cache, reconstruction_from
 from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
 from colmap_vg.jobs.mapper import map_database
+from colmap_vg.mapping.points import with_triangulated_points
 from colmap_vg.mapping.second_opinion import NEAR_DEG, PointEvidence, best_arrangement, point_evidence
 from colmap_vg.simulation.database import write_synthetic_database
 
@@ -31,6 +32,7 @@ def test_what_should_be_seen_is_counted_as_by_loops(tmp_path: Path) -> None:
     with loaded_cache(tmp_path / "a.db", tmp_path, 15) as (cache, _):
         model = reconstruction_from_solution(cache, solution, graph, 0)
         found = point_evidence(cache, model, MappingOptions())
+        model = with_triangulated_points(cache, model)
     expected = seen = observations = 0
     for point in model.points3D.values():
         images = {element.image_id for element in point.track.elements}
