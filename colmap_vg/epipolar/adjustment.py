@@ -404,8 +404,10 @@ def _minimized(
             step = system.step(terms, gradient, damping)
             if step is not None:
                 trial = cameras.moved(step, system.free, reach)
-                # A first step is nearly always accepted: compute the derivatives needed next, which include its cost.
-                ahead = _terms(problem, trial, scale, near=near) if attempt == 0 else None
+                # A first step is nearly always accepted: unless it is expected to be the last one, compute the
+                # derivatives needed next, which include its cost.
+                goes_on = attempt == 0 and -float(gradient @ step) >= end * before
+                ahead = _terms(problem, trial, scale, near=near) if goes_on else None
                 cost = _total(ahead) if ahead is not None else _cost(problem, trial, scale)
                 if cost < before:
                     break
