@@ -18,13 +18,13 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_vg.epipolar.cameras import SHORTEST_BASELINE, Cameras, CameraSteps, gauged
 from colmap_vg.epipolar.depth_agreement import TripletPoses, depth_costs, depth_equations, depth_residuals
 from colmap_vg.epipolar.normal_system import CameraTerms, NormalSystem
 from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.errors import GraphError
 from colmap_vg.events import report_progress
 from colmap_vg.geometry import so3
-from colmap_vg.geometry.directions import normalized
 from colmap_vg.linear.robust_losses import MAD_TO_SIGMA
 from colmap_vg.scene.solution import LogEntry
 from colmap_vg.two_view.sampson import cauchy_costs, frames, median_errors, normal_equations, residuals
@@ -35,11 +35,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 _MAX_DAMPING = 1e6  # share of the Hessian's diagonal
-_SHORTEST_BASELINE = 1e-6  # share of the RMS distance of cameras; keeps directions of coinciding cameras finite
 _EARLY_TOLERANCE = 300.0  # factor on the tolerance before the last stage, since the next scale changes the cameras more
-_MAX_TURN = 0.2  # radians per step
-_MAX_LOG_FOCAL_STEP = 0.3  # change of a log focal length per step
-_MAX_RADIAL_STEP = 0.1  # change of the radial term per step
 _MAX_LOG_FOCAL = np.log(3.0)  # beyond it a focal length has diverged; errors vanish with the focal length
 MAX_RADIAL_TERM = 0.6
 """Largest absolute value of the radial term, at the focal lengths of the problem; beyond it the term has diverged."""
@@ -91,63 +87,6 @@ class AdjustmentResult:
         """Poses and lenses."""
         lenses = Lenses(np.log(self.focal_scales), self.radial_term)
         return Cameras(self.cam_from_world_rotations, self.projection_centers, lenses)
-
-
-@dataclass(frozen=True, eq=False)
-class Cameras:
-    """cam_from_world rotations (n, 3, 3), centres (n, 3) and lenses."""
-
-    rotations: Array
-    centers: Array
-    lenses: Lenses
-
-    def moved(self, step: Array, free: IntArray, reach: Array | None = None) -> "Cameras":
-        """Cameras after a step (6 n + f,), w and x of each image, then the free log focals; with the gauge restored.
-
-        A last unknown, if there is one, is the radial term.
-
-        The shift of each image is limited to its `reach` (n,), so that no camera jumps at the gain of the others.
-        """
-        n = len(self.centers)
-        poses = step[: 6 * n].reshape(n, 6)
-        if reach is not None:
-            far = np.maximum(
-                np.linalg.norm(poses[:, 3:], axis=1) / reach, np.linalg.norm(poses[:, :3], axis=1) / _MAX_TURN
-            )
-            poses = poses / np.maximum(far, 1.0)[:, None]
-        log_scales, (by_focal, by_term) = self.lenses.log_scales.copy(), np.split(step[6 * n :], [len(free)])
-        log_scales[free] += np.clip(by_focal, -_MAX_LOG_FOCAL_STEP, _MAX_LOG_FOCAL_STEP)
-        term = self.lenses.radial_term + float(np.clip(by_term, -_MAX_RADIAL_STEP, _MAX_RADIAL_STEP).sum())
-        moved = so3.exp(poses[:, :3]) @ self.rotations, gauged(self.centers + poses[:, 3:])
-        return Cameras(*moved, Lenses(log_scales, term))
-
-    def reach(self, edges: IntArray) -> Array:
-        """Half the distance from each image to its nearest neighbour in the graph, with a lower limit: (n,)."""
-        length = np.linalg.norm(self.centers[edges[:, 1]] - self.centers[edges[:, 0]], axis=1)
-        nearest = np.full(len(self.centers), np.inf)
-        np.minimum.at(nearest, edges.ravel(), np.repeat(length, 2))
-        return np.asarray(0.5 * np.maximum(nearest, 0.1 * np.median(length)))
-
-    def relative(self, edges: IntArray) -> tuple[Array, Array, Array]:
-        """Relative rotations (m, 3, 3), directions (m, 3) and baselines (m,) of edges."""
-        i, j = edges.T
-        relative = self.rotations[j] @ np.swapaxes(self.rotations[i], 1, 2)
-        baseline = np.einsum("kab,kb->ka", self.rotations[i], self.centers[j] - self.centers[i])
-        length = np.linalg.norm(baseline, axis=1)
-        short = length < _SHORTEST_BASELINE
-        directions = np.where(short[:, None], [0.0, 0.0, 1.0], normalized(baseline))
-        return relative, directions, np.where(short, _SHORTEST_BASELINE, length)
-
-    def about_middle(self, images: IntArray) -> TripletPoses:
-        """Poses of triplets (q, 3) relative to their middle images."""
-        a, b, c = images.T
-        R_b = self.rotations[b]
-        baselines = np.stack([np.einsum("kab,kb->ka", R_b, self.centers[b] - self.centers[s]) for s in (a, c)])
-        short = np.linalg.norm(baselines, axis=2, keepdims=True) < _SHORTEST_BASELINE
-        return TripletPoses(
-            np.stack([R_b @ np.swapaxes(self.rotations[s], 1, 2) for s in (a, c)]),
-            np.where(short, [0.0, 0.0, _SHORTEST_BASELINE], baselines),
-        )
 
 
 def adjust_epipolar(
@@ -289,21 +228,6 @@ def _lens_diverged(cameras: Cameras) -> bool:
     return bool(np.any(np.abs(lenses.log_scales) > _MAX_LOG_FOCAL)) or abs(lenses.radial_term) > MAX_RADIAL_TERM
 
 
-def gauged(centers: Array) -> Array:
-    """Positions with centroid 0 and root mean square distance 1.
-
-    Raises
-    ------
-    GraphError
-        All positions coincide.
-    """
-    centered = centers - centers.mean(axis=0)
-    spread = np.sqrt(np.mean(np.sum(centered**2, axis=1)))
-    if not spread > 0:
-        raise GraphError("epipolar adjustment: all cameras coincide")
-    return np.asarray(centered / spread)
-
-
 def cost_and_gradient(problem: EpipolarProblem, cameras: Cameras, scale_px: float) -> tuple[float, Array]:
     """Half the Cauchy cost, and its gradient (6 n + u,) in the parameters of `Cameras.moved`."""
     terms = _terms(problem, cameras, scale_px)
@@ -360,7 +284,7 @@ def edge_chain(R_i: Array, R: Array, d: Array, length: Array) -> Array:
     chain[:, 3, :3], chain[:, 4, :3] = B[:, 1], -B[:, 0]
     chain[:, 3:, 3:6], chain[:, 3:, 9:] = -along, along
     # The direction between coinciding cameras is undefined: it must not move them apart.
-    chain[length <= _SHORTEST_BASELINE, 3:] = 0.0
+    chain[length <= SHORTEST_BASELINE, 3:] = 0.0
     return chain
 
 
@@ -374,7 +298,7 @@ def triplet_chain(R_b: Array, poses: TripletPoses) -> Array:
         chain[:, shift, 6:9] = -so3.hat(poses.baselines[side])
         chain[:, shift, first + 3 : first + 6] = -R_b
         chain[:, shift, 9:12] = R_b
-        short = np.linalg.norm(poses.baselines[side], axis=1) <= _SHORTEST_BASELINE
+        short = np.linalg.norm(poses.baselines[side], axis=1) <= SHORTEST_BASELINE
         chain[short, shift] = 0.0
     return chain
 
@@ -394,16 +318,16 @@ def _minimized(
     Far from the minimum (not `near`), where many matches have large errors, the steps are those of reweighted least
     squares, which are shorter but safer.
     """
-    system, damping = normal_system(problem), 1e-4
+    system, steps, damping = normal_system(problem), CameraSteps(cameras, problem.edges), 1e-4
     terms = _terms(problem, cameras, scale, near=near)
     before = _total(terms)
     for iteration in range(max_num_iterations):
         report_progress("epipolar adjustment")
-        gradient, reach, ahead = system.gradient(terms), cameras.reach(problem.edges), None
+        gradient, ahead = system.gradient(terms), None
         for attempt in count():
             step = system.step(terms, gradient, damping)
             if step is not None:
-                trial = cameras.moved(step, system.free, reach)
+                trial = steps.taken(cameras, step, system.free)
                 # A first step is nearly always accepted: unless it is expected to be the last one, compute the
                 # derivatives needed next, which include its cost.
                 goes_on = attempt == 0 and -float(gradient @ step) >= end * before

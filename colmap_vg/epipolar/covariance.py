@@ -17,7 +17,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from colmap_vg.epipolar.adjustment import AdjustmentResult, Cameras, edge_chain, normal_system, triplet_chain
+from colmap_vg.epipolar.adjustment import AdjustmentResult, edge_chain, normal_system, triplet_chain
+from colmap_vg.epipolar.cameras import Cameras
 from colmap_vg.epipolar.depth_agreement import depth_derivatives_by_block, depth_equations
 from colmap_vg.epipolar.normal_system import CameraTerms
 from colmap_vg.epipolar.problem import EpipolarProblem

@@ -9,7 +9,8 @@ from epipolar_scenes import pixel_scene
 
 from colmap_vg import read_view_graph, solve_view_graph
 from colmap_vg.calibration.self_calibration import estimate_focal_lengths
-from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient, gauged
+from colmap_vg.epipolar.adjustment import adjust_epipolar, cost_and_gradient
+from colmap_vg.epipolar.cameras import Cameras, gauged
 from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.geometry import so3
 from colmap_vg.geometry.directions import normalized

@@ -8,7 +8,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from colmap_vg.epipolar import adjustment
-from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient, gauged
+from colmap_vg.epipolar.adjustment import adjust_epipolar, cost_and_gradient
+from colmap_vg.epipolar.cameras import Cameras, gauged
 from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.epipolar.triplets import find_triplets
 from colmap_vg.errors import GraphError
@@ -302,19 +303,3 @@ def test_focal_lengths_that_the_matches_do_not_tell_are_held():
     assert found.lost_focals.all()
     np.testing.assert_array_equal(found.focal_scales, 1.0)
     assert not adjust_epipolar(problem, R, p, directions_of(problem, R, p)).lost_focals.any()
-
-
-def test_no_image_jumps_past_its_neighbours_in_one_step():
-    problem, R, p = scene(4)
-    cameras = Cameras(R, p, Lenses(np.zeros(2)))
-    reach = cameras.reach(problem.edges)
-    length = np.linalg.norm(p[problem.edges[:, 1]] - p[problem.edges[:, 0]], axis=1)
-    nearest = [length[(problem.edges == image).any(axis=1)].min() for image in range(len(p))]
-    np.testing.assert_allclose(reach, 0.5 * np.maximum(nearest, 0.1 * np.median(length)))
-    step = np.zeros((len(p), 6))
-    step[2, 3:], step[5, :3] = [100.0, 0.0, 0.0], [0.0, 3.0, 0.0]
-    moved = cameras.moved(step.ravel(), np.zeros(0, dtype=int), reach)
-    expected = p.copy()
-    expected[2, 0] += reach[2]
-    np.testing.assert_allclose(moved.centers, gauged(expected))
-    assert so3.angle(moved.rotations[5] @ R[5].T) == pytest.approx(0.2)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from image_sets import image_set
 
-from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar, cost_and_gradient
+from colmap_vg.epipolar.adjustment import adjust_epipolar, cost_and_gradient
+from colmap_vg.epipolar.cameras import Cameras
 from colmap_vg.epipolar.covariance import _without_gauge, camera_covariances
 from colmap_vg.epipolar.problem import Lenses
 from colmap_vg.geometry import so3

@@ -9,7 +9,8 @@ from image_sets import FOCAL, image_set
 
 from colmap_vg import align_positions
 from colmap_vg.colmap_io.cameras import has_radial_term, with_radial_term
-from colmap_vg.epipolar.adjustment import Cameras, adjust_epipolar
+from colmap_vg.epipolar.adjustment import adjust_epipolar
+from colmap_vg.epipolar.cameras import Cameras
 from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.epipolar.radial_term import fit_radial_term
 from colmap_vg.geometry.directions import normalized
@@ -102,6 +103,19 @@ def test_the_term_of_a_bent_lens_is_found_with_its_focal_length_and_positions() 
     assert abs(np.log(found.result.focal_scales[0])) < 0.01
     error, before = (align_positions(r.projection_centers, p)[0].mean() for r in (found.result, without))
     assert error < 0.1 * before
+
+
+def test_a_long_street_of_a_bent_lens_is_adjusted_in_a_few_steps() -> None:
+    """The term, the focal length and the bend of the street trade off: 72 steps that are linear in single poses."""
+    problem, R, p = image_set(2, "street", 60, 2500, 0.3, free=True)
+    curved = bent(problem, -0.1)
+    directions = Cameras(R, p, Lenses(np.zeros(1))).relative(problem.edges)[1]
+    start = Lenses(np.array([0.18]))
+    without = adjust_epipolar(curved, R, p, directions, initial_lenses=start)
+    found = fit_radial_term(curved, without, ALL)
+    assert found is not None
+    assert abs(found.result.radial_term + 0.1) < 0.01
+    assert len(without.log) + len(found.result.log) <= 40
 
 
 def test_a_straight_lens_gets_none() -> None:

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from colmap_vg.epipolar.adjustment import Cameras, gauged
+from colmap_vg.epipolar.cameras import Cameras, gauged
 from colmap_vg.epipolar.problem import EpipolarProblem, Lenses
 from colmap_vg.epipolar.triplets import find_triplets
 from colmap_vg.geometry.directions import normalized

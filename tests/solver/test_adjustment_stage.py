@@ -10,7 +10,8 @@ from image_sets import FOCAL, image_set
 from linked_scenes import near, projection_centers, street, turned, write_scene
 
 from colmap_vg import EdgeVerdict, SolveOptions, ViewGraph, align_positions, read_view_graph
-from colmap_vg.epipolar.adjustment import AdjustmentResult, Cameras, adjust_epipolar
+from colmap_vg.epipolar.adjustment import AdjustmentResult, adjust_epipolar
+from colmap_vg.epipolar.cameras import Cameras
 from colmap_vg.epipolar.problem import EpipolarProblem, Lenses, epipolar_problem
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.scene.subgraph import Subgraph
