@@ -19,7 +19,7 @@ TOLERANCE_BEFORE_POINTS = 1e-3
 simulated ones the final errors differ by 0.6 % at most, whether it is this or 1e-5."""
 MATCHES_BEFORE_POINTS, TRACKS_BEFORE_POINTS = 60, 20
 """Maximum numbers of matches of a pair and of tracks of a triplet in jobs, where bundle adjustment decides the final
-poses: with more the errors of four sets of photographs and two simulated ones differ by 3 % at most, and most are larger.
+poses: with more the errors of four sets of photographs and two simulated ones differ by 3 % at most, mostly upwards.
 Ten tracks of a triplet do not suffice: the length of a street is then lost."""
 
 
