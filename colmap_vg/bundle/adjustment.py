@@ -110,13 +110,14 @@ def adjust(
         step = longer * found.relaxation * step
         shifts = system.steps_of_points(problem, step, found.relaxation)
         trial = state.moved(problem, step, state.points + shifts, viewed)
-        at = linearize(problem, trial, loss_scale_px)
-        trial, there = _followed(problem, trial, at, loss_scale_px, found.cost)
+        there = linearize(problem, trial, loss_scale_px)
+        change = found.change_to(there)
+        trial, there = _followed(problem, trial, there, loss_scale_px, found.cost)
         if there.cost >= found.cost:
-            more, further = system.correction(problem, step, shifts, found.change_to(at), damping)
+            more, further = system.correction(problem, step, shifts, change, damping)
             trial = state.moved(problem, step + more, state.points + shifts + further, viewed)
-            at = linearize(problem, trial, loss_scale_px)
-            trial, there = _followed(problem, trial, at, loss_scale_px, found.cost)
+            there = linearize(problem, trial, loss_scale_px)
+            trial, there = _followed(problem, trial, there, loss_scale_px, found.cost)
         if there.cost < found.cost:
             gain = 2.0 * (found.cost - there.cost) / max(expected, np.finfo(np.float64).tiny)
             state, found, growth = trial, there, 2.0

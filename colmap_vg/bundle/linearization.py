@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.bundle.problem import BundleProblem, BundleState, Lens
+from colmap_vg.bundle.problem import BundleProblem, BundleState, Lens, Run
 from colmap_vg.linear.robust_losses import cauchy_loss, cauchy_weight
 
 Array = NDArray[np.float64]
@@ -101,58 +101,72 @@ def linearize(problem: BundleProblem, state: BundleState, loss_scale_px: float) 
     -------
     Linearization
     """
-    positions = np.take(np.ascontiguousarray(state.points.T), problem.point_row, axis=1)
-    rays = np.empty_like(positions)
-    for image, own in enumerate(problem.of_images):
-        rays[:, own] = positions[:, own] - state.centers[image][:, None]
-    units, distance = _in_cameras(problem, state, rays)
-    residuals, by_ray = np.empty((2, len(distance))), np.empty((2, 3, len(distance)))
-    for idx, (lens, parameters) in enumerate(zip(problem.lenses, state.parameters, strict=True)):
-        own = problem.of_lenses[idx]
-        residuals[:, own] = (lens.project(parameters, units[own]) - problem.keypoints[own]).T
-        by_ray[:, :, own] = _derivative_by_ray(lens, parameters, units[own])
-    by_ray /= distance
-    by_point = np.empty_like(by_ray)
-    for image, own in enumerate(problem.of_images):
-        by_point[:, :, own] = state.rotations[image].T @ by_ray[:, :, own]
-    lost = ~(np.isfinite(residuals).all(axis=0) & np.isfinite(by_point).all(axis=(0, 1)))
-    if lost.any():
-        residuals[:, lost] = LOST_PX / np.sqrt(2.0)
-        by_point[:, :, lost] = 0.0
-    norm = np.einsum("ak,ak->k", residuals, residuals)
-    squared = norm / loss_scale_px**2
-    weight = cauchy_weight(squared)
-    costs = np.bincount(problem.point_row, cauchy_loss(squared), minlength=len(state.points))
-    # The loss's Hessian, averaged over the direction of a residual, is the square of its weight.
-    mean, curvature = float(weight.mean()), float(np.square(weight).mean())
-    spread = float((np.square(weight) * norm).mean()) / 2.0
-    roots = np.where(lost, 0.0, np.sqrt(weight))
+    k, points = len(problem.point_row), np.ascontiguousarray(state.points.T)
+    rays, roots, losses = np.empty((3, k)), np.empty(k), np.empty(k)
+    residuals, by_point = np.empty((2, k)), np.empty((2, 3, k))
+    total, squares, spread = 0.0, 0.0, 0.0
+    for run in problem.runs:
+        own = run.observations
+        rays[:, own], r, A = _by_points(problem, state, points, run)
+        lost = ~(np.isfinite(r).all(axis=0) & np.isfinite(A).all(axis=(0, 1)))
+        if lost.any():
+            r[:, lost] = LOST_PX / np.sqrt(2.0)
+            A[:, :, lost] = 0.0
+        norm = np.einsum("ak,ak->k", r, r)
+        squared = norm / loss_scale_px**2
+        weight = cauchy_weight(squared)
+        roots[own] = np.where(lost, 0.0, np.sqrt(weight))
+        np.multiply(r, roots[own], out=residuals[:, own])
+        np.multiply(A, roots[own], out=by_point[:, :, own])
+        losses[own] = cauchy_loss(squared)
+        # The loss's Hessian, averaged over the direction of a residual, is the square of its weight.
+        square = np.square(weight)
+        total, squares = total + float(weight.sum()), squares + float(square.sum())
+        spread += float((square * norm).sum()) / 2.0
+    costs = np.bincount(problem.point_row, losses, minlength=len(state.points))
     return Linearization(
         rays,
         roots,
-        roots * residuals,
-        roots * by_point,
+        residuals,
+        by_point,
         np.asarray(0.5 * loss_scale_px**2 * costs),
-        relaxation=float(np.clip(mean / curvature, 1.0, MAX_RELAXATION)),
-        variance=max(spread * mean / curvature**2, np.finfo(np.float64).tiny),
+        relaxation=float(np.clip(total / squares, 1.0, MAX_RELAXATION)),
+        variance=max(spread * total / squares**2, np.finfo(np.float64).tiny),
     )
+
+
+def _by_points(problem: BundleProblem, state: BundleState, points: Array, run: Run) -> tuple[Array, Array, Array]:
+    """World rays (3, k), residuals (2, k) and their derivatives by points (2, 3, k) of a run, for points (3, q)."""
+    rays = np.take(points, problem.point_row[run.observations], axis=1)
+    for image, at in enumerate(run.of_images, run.first):
+        rays[:, at] -= state.centers[image][:, None]
+    units, distance = _in_cameras(state, run, rays)
+    lens, parameters = problem.lenses[run.lens], state.parameters[run.lens]
+    residuals = (lens.project(parameters, units) - problem.keypoints[run.observations]).T
+    by_ray = _derivative_by_ray(lens, parameters, units)
+    by_ray /= distance
+    for image, at in enumerate(run.of_images, run.first):
+        by_ray[:, :, at] = state.rotations[image].T @ by_ray[:, :, at]
+    return rays, residuals, by_ray
 
 
 def derivatives_by_lens(problem: BundleProblem, state: BundleState, found: Linearization) -> Array:
     """Derivatives (2, t, k) of weighted residuals by the unknown parameters of each image's lens, padded with zeros."""
-    units, _ = _in_cameras(problem, state, found.rays)
-    derivatives = np.zeros((2, problem.unknowns.shape[1] - 6, len(units)))
-    for idx, (lens, parameters) in enumerate(zip(problem.lenses, state.parameters, strict=True)):
-        own = problem.of_lenses[idx]
-        derivatives[:, : len(lens.free), own] = _derivative_by_parameters(lens, parameters, units[own])
-    return np.asarray(found.roots * np.where(np.isfinite(derivatives), derivatives, 0.0))
+    derivatives = np.zeros((2, problem.unknowns.shape[1] - 6, len(found.roots)))
+    for run in problem.runs:
+        own, lens = run.observations, problem.lenses[run.lens]
+        if len(lens.free):
+            units, _ = _in_cameras(state, run, found.rays[:, own])
+            by_lens = _derivative_by_parameters(lens, state.parameters[run.lens], units)
+            derivatives[:, : len(lens.free), own] = found.roots[own] * np.where(np.isfinite(by_lens), by_lens, 0.0)
+    return derivatives
 
 
-def _in_cameras(problem: BundleProblem, state: BundleState, rays: Array) -> tuple[Array, Array]:
-    """Unit rays (k, 3) in the frames of the cameras, and lengths (k,), of world rays (3, k)."""
+def _in_cameras(state: BundleState, run: Run, rays: Array) -> tuple[Array, Array]:
+    """Unit rays (k, 3) in the frames of the cameras, and lengths (k,), of a run's world rays (3, k)."""
     local = np.empty_like(rays)
-    for image, own in enumerate(problem.of_images):
-        local[:, own] = state.rotations[image] @ rays[:, own]
+    for image, at in enumerate(run.of_images, run.first):
+        local[:, at] = state.rotations[image] @ rays[:, at]
     distance = np.maximum(np.sqrt(np.einsum("ak,ak->k", local, local)), np.finfo(np.float64).tiny)
     return np.ascontiguousarray((local / distance).T), distance
 

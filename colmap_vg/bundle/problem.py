@@ -13,6 +13,8 @@ from colmap_vg.geometry import so3
 
 MAX_GROWTH = 2.0
 """Maximum change, either way, of the logarithm of a focal length or of a distance in one step."""
+OBSERVATIONS_PER_RUN = 8192
+"""Observations that are linearised at once."""
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -32,6 +34,26 @@ class Lens(Protocol):
 
     def project(self, parameters: Array, rays: Array) -> Array:
         """Project rays (k, 3) of the camera's frame: pixels (k, 2), NaN where a ray has no projection."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Observations of consecutive images with one lens, whose arrays fit in a processor's cache.
+
+    Attributes
+    ----------
+    lens : int
+    observations : slice
+    first : int
+        The first image.
+    of_images : list of slice
+        Observations of each image, counted from the first of the run.
+    """
+
+    lens: int
+    observations: slice
+    first: int
+    of_images: list[slice]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +98,18 @@ class BundleProblem:
         return [slice(start, end) for start, end in pairwise(self.starts.tolist())]
 
     @cached_property
-    def of_lenses(self) -> list[slice]:
-        """Observations of each lens."""
-        starts = np.searchsorted(self.camera_idx[self.image_row], np.arange(len(self.lenses) + 1))
-        return [slice(start, end) for start, end in pairwise(starts.tolist())]
+    def runs(self) -> list["Run"]:
+        """Runs of images with one lens, of about `OBSERVATIONS_PER_RUN` observations each."""
+        found, first = list[Run](), 0
+        lenses = self.camera_idx.tolist()
+        for image in range(self.num_images):
+            last = image + 1 == self.num_images or lenses[image + 1] != lenses[image]
+            if last or self.starts[image + 1] - self.starts[first] >= OBSERVATIONS_PER_RUN:
+                start = int(self.starts[first])
+                own = [slice(at.start - start, at.stop - start) for at in self.of_images[first : image + 1]]
+                found.append(Run(lenses[image], slice(start, int(self.starts[image + 1])), first, own))
+                first = image + 1
+        return found
 
     @cached_property
     def unknowns(self) -> IntArray:
@@ -108,10 +138,11 @@ class BundleProblem:
         return 6 * self.num_images + sum(len(lens.free) for lens in self.lenses)
 
     @cached_property
-    def common(self) -> list[tuple[IntArray, IntArray, IntArray]]:
+    def common(self) -> list[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
         """Observations of one point by two images: for each image i ``(own, other, images)``.
 
-        Observation ``own[k]`` of image i and ``other[k]`` of a later image, ``images[k]``, which ascends.
+        Observation ``own[k]`` of image i and ``other[k]`` of a later image, ``images[k]``, which ascends. Of all that an
+        adjustment holds these are most.
         """
         by_point = np.argsort(self.point_row, kind="stable")
         place = np.empty_like(by_point)
@@ -125,7 +156,8 @@ class BundleProblem:
             rank = np.arange(len(repeated)) - np.repeat(np.cumsum(following) - following, following)
             other = by_point[place[repeated] + 1 + rank]
             order = np.argsort(other, kind="stable")
-            found.append((repeated[order], other[order], self.image_row[other[order]]))
+            own, other = repeated[order].astype(np.int32), other[order].astype(np.int32)
+            found.append((own, other, self.image_row[other].astype(np.int32)))
         return found
 
 

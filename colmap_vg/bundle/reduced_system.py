@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from colmap_vg.bundle.linearization import Linearization, derivatives_by_lens
 from colmap_vg.bundle.point_systems import PointFactors, factored, gradients
 from colmap_vg.bundle.problem import BundleProblem, BundleState
+from colmap_vg.geometry import so3
 from colmap_vg.linear.assembly import BlockPattern, scattered
 from colmap_vg.linear.solvers import factorize
 
@@ -53,8 +54,10 @@ class ReducedSystem:
         Unknowns that are not of held poses.
     matrix : (u, u) csc_array
     gradient : (u,) array
-    derivatives : (2, w, k) array
-        Of the residuals by the unknowns of their images.
+    rays : (3, k) array
+        Point minus projection centre, world frame.
+    by_lens : (2, t, k) array
+        Derivatives of the residuals by the unknowns of their lenses.
     by_point : (2, 3, k) array
         Derivatives by points.
     across : (2, 3, k) array
@@ -67,7 +70,8 @@ class ReducedSystem:
     free: IntArray
     matrix: sp.csc_array
     gradient: Array
-    derivatives: Array
+    rays: Array
+    by_lens: Array
     by_point: Array
     across: Array
     factors: PointFactors
@@ -83,13 +87,21 @@ class ReducedSystem:
         of_points = factors.lower(gradients(q, rows, by_point, found.residuals))
         own_factors = factors.at(rows)
         across = np.stack([own_factors.lower(by_point[0]), own_factors.lower(by_point[1])])
-        derivatives = _by_unknowns(found, derivatives_by_lens(problem, state, found))
-        own, pairs, gradient = _blocks(problem, pattern, found.residuals, derivatives, across, of_points)
+        by_lens = derivatives_by_lens(problem, state, found)
+        own, pairs, gradient = _blocks(problem, pattern, found, by_lens, across, of_points)
         matrix = _assembled(problem, pattern, own, pairs)
         places, used = problem.unknowns.ravel(), problem.unknowns.ravel() >= 0
         total = np.bincount(places[used], gradient.ravel()[used], minlength=problem.num_unknowns)
         return cls(
-            problem.free, matrix, np.asarray(total, dtype=np.float64), derivatives, by_point, across, factors, of_points
+            problem.free,
+            matrix,
+            np.asarray(total, dtype=np.float64),
+            found.rays,
+            by_lens,
+            by_point,
+            across,
+            factors,
+            of_points,
         )
 
     def step(self, damping: float) -> Array:
@@ -112,8 +124,7 @@ class ReducedSystem:
 
     def steps_of_points(self, problem: BundleProblem, step: Array, relaxation: float) -> Array:
         """Steps (q, 3) of the points that go with a step of the unknowns: its effect, and their own times a factor."""
-        padded = np.append(step, 0.0)[problem.unknowns].T
-        changes = np.einsum("awk,wk->ak", self.derivatives, np.take(padded, problem.image_row, axis=1))
+        changes = self._changes(problem, step)
         induced = gradients(self.of_points.shape[1], problem.point_row, self.across, changes)
         return -self.factors.upper(induced + relaxation * self.of_points).T
 
@@ -139,24 +150,35 @@ class ReducedSystem:
         step : (u,) array
         shifts : (q, 3) array
         """
-        padded = np.append(step, 0.0)[problem.unknowns].T
-        linear = np.einsum("awk,wk->ak", self.derivatives, np.take(padded, problem.image_row, axis=1))
+        linear = self._changes(problem, step)
         moved = np.take(np.ascontiguousarray(shifts.T), problem.point_row, axis=1)
         bent = change - linear - np.einsum("abk,bk->ak", self.by_point, moved)
         of_points = self.factors.lower(gradients(len(shifts), problem.point_row, self.by_point, bent))
         left = bent - np.einsum("abk,bk->ak", self.across, np.take(of_points, problem.point_row, axis=1))
-        pulls = np.einsum("awk,ak->wk", self.derivatives, left)
         gradient = np.zeros(len(self.gradient) + 1)
         for row, own in zip(problem.unknowns, problem.of_images, strict=True):
-            gradient[row] += pulls[:, own].sum(axis=1)
+            D = _by_unknowns(self.by_point[:, :, own], self.rays[:, own], self.by_lens[:, :, own])
+            gradient[row] += np.einsum("awk,ak->w", D, left[:, own])
         further = replace(self, gradient=gradient[:-1], of_points=of_points)
         more = further.step(damping)
         return more, further.steps_of_points(problem, more, 1.0)
 
+    def _changes(self, problem: BundleProblem, step: Array) -> Array:
+        """Linear changes (2, k) of the residuals by a step (u,) of the unknowns, with the points fixed."""
+        padded, changes = np.append(step, 0.0)[problem.unknowns], np.empty((2, self.rays.shape[1]))
+        for (turn, shift, by_lens), own in zip(
+            ((row[:3], row[3:6], row[6:]) for row in padded), problem.of_images, strict=True
+        ):
+            # With dr/dw = -A x d row by row: its product with w is A (w x d).
+            by_ray = so3.hat(turn) @ self.rays[:, own] - shift[:, None]
+            changes[:, own] = np.einsum("abk,bk->ak", self.by_point[:, :, own], by_ray)
+            if len(by_lens):
+                changes[:, own] += np.einsum("atk,t->ak", self.by_lens[:, :, own], by_lens)
+        return changes
 
-def _by_unknowns(found: Linearization, by_lens: Array) -> Array:
-    """Derivatives (2, w, k) by rotation, position and lens of each observation's image."""
-    A, d = found.by_point, found.rays
+
+def _by_unknowns(A: Array, d: Array, by_lens: Array) -> Array:
+    """Derivatives (2, w, k) by rotation, position and lens of one image, from those by points and the world rays."""
     derivatives = np.empty((2, 6 + by_lens.shape[1], d.shape[1]))
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
@@ -169,17 +191,17 @@ def _by_unknowns(found: Linearization, by_lens: Array) -> Array:
 def _blocks(
     problem: BundleProblem,
     pattern: ReducedPattern,
-    residuals: Array,
-    derivatives: Array,
+    found: Linearization,
+    by_lens: Array,
     across: Array,
     of_points: Array,
 ) -> tuple[Array, Array, Array]:
     """Blocks of images (n, w, w) and of pairs (m, w, w), and gradients (n, w)."""
-    _, width, count = derivatives.shape
-    eliminated = np.empty((count, 3, width))
+    width, residuals = problem.unknowns.shape[1], found.residuals
+    eliminated = np.empty((residuals.shape[1], 3, width))
     own, gradient = np.empty((problem.num_images, width, width)), np.empty((problem.num_images, width))
     for image, at in enumerate(problem.of_images):
-        D, A = derivatives[:, :, at], across[:, :, at]
+        D, A = _by_unknowns(found.by_point[:, :, at], found.rays[:, at], by_lens[:, :, at]), across[:, :, at]
         eliminated[at] = (D[0] * A[0][:, None] + D[1] * A[1][:, None]).transpose(2, 0, 1)
         F, Z = D.transpose(2, 0, 1).reshape(-1, width), eliminated[at].reshape(-1, width)
         own[image] = F.T @ F - Z.T @ Z

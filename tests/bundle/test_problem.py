@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bundle_scenes import FOCAL, plain_residuals, scene
+from bundle_scenes import FOCAL, displaced, plain_residuals, scene
 
 from colmap_vg.bundle.adjustment import adjust
 from colmap_vg.bundle.problem import MAX_GROWTH, BundleProblem, BundleState
@@ -108,3 +108,29 @@ def test_a_focal_length_far_off_is_found_in_four_steps(monkeypatch: pytest.Monke
     adjust(problem, start, loss_scale)
     assert states[3].parameters[0][0] == pytest.approx(3.0 * FOCAL, rel=2e-3)
     assert len(states) == 4
+
+
+@pytest.mark.parametrize("limit", [1, 70, 10_000])
+def test_runs_cover_all_observations_once_lens_by_lens(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = adjusted_from_afar()
+    monkeypatch.setattr("colmap_vg.bundle.problem.OBSERVATIONS_PER_RUN", limit)
+    problem, _ = scene(num_images=7, num_lenses=3)
+    runs = problem.runs
+    assert [run.observations.start for run in runs] == [0, *(run.observations.stop for run in runs[:-1])]
+    assert runs[-1].observations.stop == len(problem.image_row)
+    for run in runs:
+        images = range(run.first, run.first + len(run.of_images))
+        assert {int(problem.camera_idx[image]) for image in images} == {run.lens}
+        for image, at in zip(images, run.of_images, strict=True):
+            assert (problem.image_row[run.observations][at] == image).all()
+    assert 3 <= len(runs) <= 7
+    assert len(runs) == {1: 7, 10_000: 3}.get(limit, len(runs))
+    for one, other in zip(adjusted_from_afar(), expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def adjusted_from_afar() -> tuple[np.ndarray, np.ndarray]:
+    """Positions and points after a few steps."""
+    problem, truth = scene(num_images=7, num_lenses=3, sigma_px=0.3)
+    found = adjust(problem, displaced(problem, truth, 1e-3), 2.0).state
+    return found.centers, found.points
