@@ -141,8 +141,7 @@ class BundleProblem:
     def common(self) -> list[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
         """Observations of one point by two images: for each image i ``(own, other, images)``.
 
-        Observation ``own[k]`` of image i and ``other[k]`` of a later image, ``images[k]``, which ascends. Of all that an
-        adjustment holds these are most.
+        Observation ``own[k]`` of image i and ``other[k]`` of a later image, ``images[k]``, which ascends.
         """
         by_point = np.argsort(self.point_row, kind="stable")
         place = np.empty_like(by_point)
