@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from colmap_vg.events import report_progress
+from colmap_vg.geometry.directions import norm_of_cross
 from colmap_vg.two_view.pieces import Pieces
 from colmap_vg.two_view.segments import (
     evenly_thinned,
@@ -113,7 +114,7 @@ def find_triplets(
     """
     m, k = len(edges), len(bearings1)
     turned = products_of_segments(relative_rotations, offsets, bearings1)
-    sine = np.linalg.norm(np.cross(turned, bearings2), axis=1)
+    sine = norm_of_cross(turned, bearings2)
     # Half-edges at the first images, then those at the second ones; rows of matches in the same order.
     report_progress("tracks")
     middle, other = edges.T.ravel(), edges[:, ::-1].T.ravel()
@@ -158,14 +159,16 @@ def _select_pairs(
     column = (np.cumsum(highest) - highest)[image] + keypoints[rows]
     size = (len(chosen), int(highest.sum()))
     seen = sp.csr_array((sine[rows], column, offsets), shape=size)
-    ones = sp.csr_array((np.ones(len(rows)), column, offsets), shape=size)
-    count = sp.coo_array(sp.triu(ones @ ones.T, k=1))
+    across = sp.csr_array(seen.T)
+    ones = sp.csr_array((np.ones(len(rows)), seen.indices, seen.indptr), shape=size)
+    back = sp.csr_array((np.ones(len(rows)), across.indices, across.indptr), shape=size[::-1])
+    count = sp.coo_array(sp.triu(ones @ back, k=1))
     a, c = count.coords
     enough = (count.data >= MIN_TRACKS) & (other[a] != other[c])
     a, c = a[enough].astype(np.int64), c[enough].astype(np.int64)
     if len(a) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    products = sp.csr_array(seen @ seen.T)
+    products = sp.csr_array(seen @ across)
     score = np.asarray(products[a, c]).ravel()
     edge_a, edge_c = chosen[a] % num_edges, chosen[c] % num_edges
     tree = _maximum_spanning_forest(edge_a, edge_c, score, num_edges)
