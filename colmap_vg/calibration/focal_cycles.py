@@ -248,7 +248,7 @@ def _cycle_cost(
         poses.directions,
         focal_x[first],
         focal_x[second],
-        num_iterations=num_steps,
+        max_num_steps=num_steps,
     )
     # Unobservable parameters get a standard deviation of a radian instead of an infinite one.
     covariance = np.linalg.inv(refined.information + np.eye(5))[:, :3, :3]

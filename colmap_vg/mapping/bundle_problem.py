@@ -131,8 +131,9 @@ class ModelProblem:
         for image_id, R, center in zip(self.image_ids, state.rotations, state.centers, strict=True):
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ center)
             reconstruction.frame(reconstruction.image(image_id).frame_id).rig_from_world = pose
-        for point_id, position in zip(self.point_ids, state.points, strict=True):
-            reconstruction.point3D(point_id).xyz = position
+        moved = np.ones(len(state.points), dtype=bool) if self.problem.fixed is None else ~self.problem.fixed
+        for row in np.flatnonzero(moved).tolist():
+            reconstruction.point3D(self.point_ids[row]).xyz = state.points[row]
 
 
 def _rows_of(ids: list[int], wanted: IntArray) -> IntArray:

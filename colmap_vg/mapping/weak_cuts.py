@@ -37,7 +37,7 @@ MAX_FORESHORTENING = 0.3
 see. It also leaves out what one of them sees from behind, and what hides behind a corner."""
 NUM_NEIGHBORS, MAX_FLATNESS = 12, 0.05
 """Points that determine the normal of the surface; maximum ratio of their two smallest variances where it is one."""
-MAX_NUM_POINTS = 1500
+MAX_NUM_POINTS = 1000
 """Maximum number of sampled points."""
 MIN_EXPECTED = 30
 """Minimum number of expected observations across a cut to judge it."""

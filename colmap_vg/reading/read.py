@@ -24,6 +24,7 @@ from colmap_vg.reading.still_background import without_still_background
 from colmap_vg.reading.verification import with_verified_geometries
 from colmap_vg.scene.marked_pairs import with_marked_pairs
 from colmap_vg.scene.view_graph import ViewGraph
+from colmap_vg.two_view.edge_information import MAX_NUM_STEPS
 from colmap_vg.two_view.segments import evenly_thinned, segment_subset
 
 Array = NDArray[np.float64]
@@ -71,7 +72,8 @@ def read_with_caveats(
     else:
         tables, given = with_given_cameras(tables, model)
         explained, told = explained_pairs(tables, given, options)
-        graph, caveats = _read(of_pairs(tables, ~explained), database_path, options, given.calibrated)
+        rest = of_pairs(tables, ~explained)  # only to check that poses agree: their own need not be refined
+        graph, caveats = _read(rest, database_path, options, given.calibrated, max_num_steps=0)
         graph, caveats = with_pairs_of_model(graph, tables, explained, given), (*told, *caveats)
     priors, ignored = read_pose_priors(database_path, tables.image_ids.tolist())
     rigs = read_rigs(database_path, tables.image_ids)
@@ -79,7 +81,11 @@ def read_with_caveats(
 
 
 def _read(
-    tables: DatabaseTables, database_path: str | PathLike[str], options: ReadOptions, calibrated: BoolArray
+    tables: DatabaseTables,
+    database_path: str | PathLike[str],
+    options: ReadOptions,
+    calibrated: BoolArray,
+    max_num_steps: int = MAX_NUM_STEPS,
 ) -> tuple[ViewGraph, tuple[str, ...]]:
     """Graph of the pairs of the tables; marked cameras (c,) keep their calibration."""
     report_progress("distortion")
@@ -97,16 +103,24 @@ def _read(
     report_progress("focal lengths")
     focals = decide_focal_lengths(tables, options, calibrated, replaced)
     report_progress("relative poses")
-    return _graph(tables, focals, changed, terms, options), (*tables.caveats, *focals.caveats)
+    graph = _graph(tables, focals, changed, terms, options, max_num_steps)
+    return graph, (*tables.caveats, *focals.caveats)
 
 
 def _graph(
-    tables: DatabaseTables, focals: FocalDecision, changed: BoolArray, terms: Array, options: ReadOptions
+    tables: DatabaseTables,
+    focals: FocalDecision,
+    changed: BoolArray,
+    terms: Array,
+    options: ReadOptions,
+    max_num_steps: int,
 ) -> ViewGraph:
     cameras = [with_focal_scale(c, s) for c, s in zip(tables.cameras, focals.scales, strict=True)]
     offsets, matches, bearings1, bearings2 = _rays_of_matches(tables, cameras)
     report_progress("relative poses")
-    geometry = relative_poses(tables, focals.scales, focals.known, offsets, bearings1, bearings2, options)
+    geometry = relative_poses(
+        tables, focals.scales, focals.known, offsets, bearings1, bearings2, options, max_num_steps
+    )
     report_progress("relative poses")
     num_inliers = np.diff(offsets)
     thin = evenly_thinned(offsets, options.max_num_inliers_per_edge)

@@ -24,7 +24,7 @@ from colmap_vg.events import report_progress
 from colmap_vg.geometry.directions import normalized
 from colmap_vg.options import ReadOptions
 from colmap_vg.scene.verdicts import EdgeVerdict
-from colmap_vg.two_view.edge_information import refine_relative_poses
+from colmap_vg.two_view.edge_information import MAX_NUM_STEPS, refine_relative_poses
 from colmap_vg.two_view.eight_point import estimate_essential_from_inliers
 from colmap_vg.two_view.essential import (
     RelativePoses,
@@ -146,6 +146,7 @@ def relative_poses(
     bearings1: Array,
     bearings2: Array,
     options: ReadOptions,
+    max_num_steps: int = MAX_NUM_STEPS,
 ) -> PairGeometry:
     """Estimate the relative poses of all pairs, and give each a verdict.
 
@@ -162,6 +163,8 @@ def relative_poses(
         Unit vectors in the first and the second camera's frame.
     options : ReadOptions
         `min_num_inliers` and `max_matches_per_pose`.
+    max_num_steps : int
+        Maximum number of steps that refine each pose.
 
     Returns
     -------
@@ -186,6 +189,7 @@ def relative_poses(
         poses.directions,
         focal[cameras[:, 0]],
         focal[cameras[:, 1]],
+        max_num_steps=max_num_steps,
     )
     rotations = np.where(enough[:, None, None], refined.rotations, poses.rotations)
     directions = np.where(enough[:, None], refined.directions, poses.directions)

@@ -29,6 +29,8 @@ IntArray = NDArray[np.int64]
 
 _MIN_SIGMA_PX = 0.02  # pixels; below the noise of real keypoints, and keeps the information of exact data finite
 _TOLERANCES = (1e-2, 1e-5, 1e-7)  # relative cost change, one per round; early rounds are redone at the next scale
+MAX_NUM_STEPS = 30
+"""Maximum number of steps of each edge, all rounds together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ def refine_relative_poses(
     focal_lengths1: Array,
     focal_lengths2: Array,
     *,
-    num_iterations: int = 30,
+    max_num_steps: int = MAX_NUM_STEPS,
 ) -> RefinedEdges:
     """Minimise the Cauchy Sampson error of each edge over its relative pose, and estimate its information matrix.
 
@@ -87,7 +89,7 @@ def refine_relative_poses(
         Directions of camera 2's centre in camera 1's frame to start from.
     focal_lengths1, focal_lengths2 : (m,) array
         Focal lengths of each edge's cameras, pixels.
-    num_iterations : int
+    max_num_steps : int
         Most steps per edge, all rounds together; an edge stops when its cost does.
 
     Returns
@@ -99,9 +101,9 @@ def refine_relative_poses(
     R, d = rotations.astype(np.float64), normalized(directions.astype(np.float64))
     information, median, sigma = np.zeros((m, 5, 5)), np.full(m, np.nan), np.full(m, np.nan)
     matches = Matches.of_rays(offsets, bearings1, bearings2, focal_lengths1**-2.0, focal_lengths2**-2.0).of(filled)
-    for tolerance in _TOLERANCES:
+    most = -(-max_num_steps // len(_TOLERANCES))
+    for tolerance in _TOLERANCES if most else ():
         scale = EFFICIENT_CAUCHY * _robust_sigmas(matches, R[filled], d[filled])
-        most = -(-num_iterations // len(_TOLERANCES))
         R[filled], d[filled] = _levenberg(matches, R[filled], d[filled], scale, most, tolerance)
     median[filled], sigma[filled] = _medians_and_sigmas(matches, R[filled], d[filled])
     information[filled] = _information(matches, R[filled], d[filled], sigma[filled])

@@ -58,6 +58,11 @@ def is_false(graph: ViewGraph) -> np.ndarray:
     return np.array([tuple(pair) in wrong for pair in graph.edges.tolist()])
 
 
+def apart(one: ViewGraph, other: ViewGraph) -> np.ndarray:
+    """Angles (m,) between the relative rotations of two graphs, radians."""
+    return so3.angle(one.cam2_from_cam1_rotations @ np.swapaxes(other.cam2_from_cam1_rotations, 1, 2))
+
+
 def test_pairs_of_the_model_have_its_poses_and_others_their_own(database: Path) -> None:
     graph, caveats = read_with_caveats(database, ReadOptions(), model_of(VIEWS, database))
     plain, _ = read_with_caveats(database, ReadOptions())
@@ -74,8 +79,10 @@ def test_pairs_of_the_model_have_its_poses_and_others_their_own(database: Path) 
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     np.testing.assert_allclose(graph.cam2_in_cam1_directions[given], directions[given], atol=1e-12)
     assert (graph.read_verdicts[given] == "kept").all()
-    for name in ("cam2_from_cam1_rotations", "cam2_in_cam1_directions", "edge_information", "triangulation_angles"):
-        np.testing.assert_array_equal(getattr(graph, name)[~given], getattr(plain, name)[~given])
+    # Their own poses are not refined: they only check those of added images.
+    assert np.degrees(apart(graph, plain)[~given]).max() < 1.0
+    cosine = np.sum(graph.cam2_in_cam1_directions * plain.cam2_in_cam1_directions, axis=1)
+    assert np.degrees(np.arccos(np.clip(cosine[~given], -1.0, 1.0))).max() < 5.0
     assert (np.diff(graph.inlier_offsets)[given] == 0).all()
     k = int(np.flatnonzero(~given)[-1])
     rows, of_plain = (slice(*g.inlier_offsets[k : k + 2]) for g in (graph, plain))
@@ -88,7 +95,7 @@ def test_pairs_that_contradict_the_model_are_estimated_and_count_against_it(data
     graph, _ = read_with_caveats(database, ReadOptions(), model)
     plain, _ = read_with_caveats(database, ReadOptions())
     of_wrong = (graph.edges == wrong).any(axis=1) | is_false(graph)
-    np.testing.assert_array_equal(graph.cam2_from_cam1_rotations[of_wrong], plain.cam2_from_cam1_rotations[of_wrong])
+    assert np.degrees(apart(graph, plain)[of_wrong]).max() < 1.0
     R, centers = VIEWS.cam_from_world_rotations.copy(), VIEWS.projection_centers
     R[wrong] = so3.exp(np.array([0.0, np.radians(20.0), 0.0])) @ R[wrong]
     agreement = pair_agreement(graph, R, centers, np.zeros(len(R), dtype=np.int64))[0]

@@ -45,7 +45,7 @@ def test_exact_matches_give_exact_poses_and_edges_without_matches_stay():
 def test_minimum_is_the_one_that_scipy_finds():
     data = matched_rays(1, [80], sigma=6e-4, outlier_share=0.1)
     f1, f2 = np.array([900.0]), np.array([500.0])
-    found = _refine(data, data.rotations, data.directions, f1, f2, num_iterations=200)
+    found = _refine(data, data.rotations, data.directions, f1, f2, max_num_steps=200)
     scale = EFFICIENT_CAUCHY * found.sigmas_px[0]
 
     def residuals(x):
