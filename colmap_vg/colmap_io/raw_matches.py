@@ -39,11 +39,16 @@ def with_raw_matches(tables: DatabaseTables, database_path: str | PathLike[str],
             i, j = tables.pairs[row].tolist()
             raw = raw_matches(connection, tables, (i, j))
             kept[row] = kept[row] if raw is None else raw
+    offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
+    return without_matrices(replace(tables, matches=np.concatenate(kept), offsets=offsets), marked)
+
+
+def without_matrices(tables: DatabaseTables, marked: BoolArray) -> DatabaseTables:
+    """Replace the matrices and poses of marked pairs (m,) by NaN."""
     matrices = {name: getattr(tables, name).copy() for name in _MATRICES}
     for matrix in matrices.values():
         matrix[marked] = np.nan
-    offsets = np.concatenate([[0], np.cumsum([len(m) for m in kept])]).astype(np.int64)
-    return replace(tables, matches=np.concatenate(kept), offsets=offsets, **matrices)
+    return replace(tables, **matrices)
 
 
 def with_unverified_pairs(

@@ -3,11 +3,13 @@
 from dataclasses import replace
 from os import PathLike
 
+import numpy as np
 import pycolmap
 
 from colmap_vg.events import StageLog
 from colmap_vg.mapping.extension import check_image_names
 from colmap_vg.options import MappingOptions, ReadOptions, SolveOptions
+from colmap_vg.reading.found_lenses import FoundLenses
 from colmap_vg.reading.read import read_with_caveats
 from colmap_vg.scene.pose_priors import PosePriors
 from colmap_vg.scene.solution import PoseSolution
@@ -21,6 +23,9 @@ MATCHES_BEFORE_POINTS, TRACKS_BEFORE_POINTS = 60, 20
 """Maximum numbers of matches of a pair and of tracks of a triplet in jobs, where bundle adjustment decides the final
 poses: with more the errors of four sets of photographs and two simulated ones differ by 3 % at most, mostly upwards.
 Ten tracks of a triplet do not suffice: the length of a street is then lost."""
+AGREEING_WITH_LENSES = 0.9
+"""Share of the inlier matches in pairs that agree with a solution below which they are estimated again, if it found
+distortion."""
 
 
 def read_job_graph(
@@ -28,6 +33,7 @@ def read_job_graph(
     options: MappingOptions,
     log: StageLog,
     given: "pycolmap.Reconstruction | None" = None,
+    lenses: FoundLenses | None = None,
 ) -> ViewGraph:
     """Read the viewing graph as a stage, with the measured positions that the options want.
 
@@ -38,9 +44,11 @@ def read_job_graph(
     log : StageLog
     given : pycolmap.Reconstruction, optional
         Model to start from; the database must have all its images.
+    lenses : FoundLenses, optional
+        Of a first solution.
     """
     with log.stage("view graph"):
-        graph, caveats = read_with_caveats(database_path, read_options(options), given)
+        graph, caveats = read_with_caveats(database_path, read_options(options), given, lenses)
         if given is not None:
             check_image_names(given, graph.image_names)
         for caveat in caveats:
@@ -71,6 +79,17 @@ def _wanted_priors(priors: PosePriors | None, options: MappingOptions) -> PosePr
             (options.prior_position_std_x, options.prior_position_std_y, options.prior_position_std_z)
         )
     return priors
+
+
+def lenses_to_read_with(graph: ViewGraph, solution: PoseSolution) -> FoundLenses | None:
+    """Lenses to estimate pairs with again, where a solution found distortion and few of them agree; otherwise None."""
+    terms, focal_lengths = solution.radial_terms, graph.camera_focal_lengths
+    if terms is None or focal_lengths is None or not np.any(terms) or not solution.agreement:
+        return None
+    if solution.agreement[0].inliers >= AGREEING_WITH_LENSES and not solution.arrangements:
+        return None
+    before = np.zeros(len(terms)) if graph.found_radial_terms is None else graph.found_radial_terms
+    return FoundLenses(focal_lengths * solution.focal_scales, terms, before)
 
 
 def solve_job_graph(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:

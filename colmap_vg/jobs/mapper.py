@@ -15,7 +15,7 @@ from colmap_vg.colmap_io.shared_cameras import shared_cameras, with_database_cam
 from colmap_vg.errors import MappingError
 from colmap_vg.events import StageEvent, StageLog
 from colmap_vg.jobs.finished_solution import solution_of_models, solution_of_reading, with_edges_of_models
-from colmap_vg.jobs.graph import read_job_graph, solve_job_graph, solve_options
+from colmap_vg.jobs.graph import lenses_to_read_with, read_job_graph, solve_job_graph, solve_options
 from colmap_vg.jobs.joining import BuiltModel, compared_images, join_models
 from colmap_vg.jobs.output_folder import publish_models, refuse_models, stage_models, work_folder
 from colmap_vg.mapping.build import (
@@ -151,7 +151,7 @@ def map_database(
         given = None if input_path is None else read_input_model(input_path)
         graph = read_job_graph(database_path, options, log, given)
         if given is None:
-            solution, built = _solved_models(database_path, work, graph, options, log)
+            graph, solution, built = _solved_models(database_path, work, graph, options, log)
         else:
             solution, built = solution_of_reading(graph), [_extended(database_path, work, graph, given, options, log)]
         cuts = _weak_cuts(database_path, graph, built, log)
@@ -178,9 +178,16 @@ def map_database(
 
 def _solved_models(
     database_path: str | PathLike[str], work: Path, graph: ViewGraph, options: MappingOptions, log: StageLog
-) -> tuple[PoseSolution, list[BuiltModel]]:
-    """Solve a viewing graph and build the models of its components."""
+) -> tuple[ViewGraph, PoseSolution, list[BuiltModel]]:
+    """Solve a viewing graph, read again if it has other lenses, and build the models of its components."""
     solution = solve_job_graph(graph, options, log)
+    if lenses := lenses_to_read_with(graph, solution):
+        log.warn(
+            "The matches tell of distortion that the database's lenses do not have: the relative poses are estimated"
+            " again with it."
+        )
+        graph = read_job_graph(database_path, options, log, lenses=lenses)
+        solution = solve_job_graph(graph, options, log)
     if not solution.registered.any():
         raise MappingError(f"{database_path}: {solution.message}")
     if solution.arrangements and graph.has_inliers and options.solve.method == "epipolar":
@@ -192,7 +199,7 @@ def _solved_models(
             " enough points with a sufficient triangulation angle; add overlapping photographs, taken from"
             " different places"
         )
-    return solution, built
+    return graph, solution, built
 
 
 def _extended(

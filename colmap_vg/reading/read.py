@@ -18,6 +18,7 @@ from colmap_vg.options import ReadOptions
 from colmap_vg.reading.distortion import with_found_distortion
 from colmap_vg.reading.fisheyes import with_found_fisheye_focals
 from colmap_vg.reading.focals import FocalDecision, decide_focal_lengths
+from colmap_vg.reading.found_lenses import FoundLenses, with_found_lenses
 from colmap_vg.reading.given_model import explained_pairs, of_pairs, with_given_cameras, with_pairs_of_model
 from colmap_vg.reading.relative_poses import relative_poses
 from colmap_vg.reading.still_background import without_still_background
@@ -60,15 +61,20 @@ def read_view_graph(database_path: str | PathLike[str], options: ReadOptions | N
 
 @single_threaded_blas
 def read_with_caveats(
-    database_path: str | PathLike[str], options: ReadOptions, model: "pycolmap.Reconstruction | None" = None
+    database_path: str | PathLike[str],
+    options: ReadOptions,
+    model: "pycolmap.Reconstruction | None" = None,
+    lenses: FoundLenses | None = None,
 ) -> tuple[ViewGraph, tuple[str, ...]]:
     """Read the viewing graph, and sentences on what was changed or could not be decided on reading.
 
     With a `model` of some of the images, its calibrations are used, and pairs that it explains get its relative poses.
+    With the `lenses` of a first solution, relative poses are estimated with them.
     """
     tables = read_tables(database_path)
     if model is None:
-        graph, caveats = _read(tables, database_path, options, np.zeros(len(tables.cameras), dtype=bool))
+        nothing = np.zeros(len(tables.cameras), dtype=bool)
+        graph, caveats = _read(tables, database_path, options, nothing, lenses=lenses)
     else:
         tables, given = with_given_cameras(tables, model)
         explained, told = explained_pairs(tables, given, options)
@@ -85,23 +91,31 @@ def _read(
     database_path: str | PathLike[str],
     options: ReadOptions,
     calibrated: BoolArray,
+    *,
+    lenses: FoundLenses | None = None,
     max_num_steps: int = MAX_NUM_STEPS,
 ) -> tuple[ViewGraph, tuple[str, ...]]:
     """Graph of the pairs of the tables; marked cameras (c,) keep their calibration."""
+    terms, found = np.zeros(len(tables.cameras)), np.zeros(len(tables.cameras), dtype=bool)
+    if lenses is not None:
+        tables, terms, found = with_found_lenses(tables, lenses)
+    with_lens = found.copy()
     report_progress("distortion")
-    terms = np.zeros(len(tables.cameras))
     if options.find_distortion:
-        tables, terms = with_found_distortion(tables, database_path, calibrated)
+        tables, more = with_found_distortion(tables, database_path, calibrated | found)
+        terms = terms + more
     report_progress("focal lengths")
-    tables, replaced = with_found_fisheye_focals(tables, database_path, options, calibrated)
+    tables, replaced = with_found_fisheye_focals(tables, database_path, options, calibrated | found)
+    found |= replaced
     report_progress("still background")
     tables, thinned = without_still_background(tables, database_path)
     report_progress("verification")
-    expected = thinned | (replaced | (terms != 0.0))[tables.camera_idx[tables.pairs]].any(axis=1)
-    tables, changed = with_verified_geometries(tables, options.random_seed, expected)
+    of_inliers = np.asarray(with_lens[tables.camera_idx[tables.pairs]].any(axis=1)) & ~thinned
+    expected = thinned | (found | (terms != 0.0))[tables.camera_idx[tables.pairs]].any(axis=1)
+    tables, changed = with_verified_geometries(tables, options.random_seed, expected, of_inliers)
     changed |= thinned
     report_progress("focal lengths")
-    focals = decide_focal_lengths(tables, options, calibrated, replaced)
+    focals = decide_focal_lengths(tables, options, calibrated, found)
     report_progress("relative poses")
     graph = _graph(tables, focals, changed, terms, options, max_num_steps)
     return graph, (*tables.caveats, *focals.caveats)

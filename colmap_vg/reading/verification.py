@@ -36,6 +36,8 @@ MAX_ERROR_PX = 4.0
 """COLMAP's threshold of two-view verification, pixels."""
 MIN_SHARE_AGREEING = 0.97
 """Minimum share of a pair's matches within the threshold of one fundamental matrix for them to count as verified."""
+MIN_SHARE_OF_INLIERS = 0.5
+"""The same where the matches were verified before."""
 MAX_MATCHES_CHECKED = 100
 """Maximum number of a pair's matches that check its matrices."""
 MIN_NUM_MATCHES, MIN_NUM_REFITTED = 15, 8
@@ -45,7 +47,7 @@ FAR = 1e12
 
 
 def with_verified_geometries(
-    tables: DatabaseTables, seed: int, expected: BoolArray | None = None
+    tables: DatabaseTables, seed: int, expected: BoolArray | None = None, of_inliers: BoolArray | None = None
 ) -> tuple[DatabaseTables, BoolArray]:
     """Replace the two-view geometries that do not explain their matches.
 
@@ -56,6 +58,8 @@ def with_verified_geometries(
         Random seed of the verification.
     expected : (m,) bool array, optional
         Pairs that are known to need new geometries, and for which there is no warning.
+    of_inliers : (m,) bool array, optional
+        Pairs whose matches were verified before with another lens: they are verified again where most do not agree.
 
     Returns
     -------
@@ -88,12 +92,18 @@ def with_verified_geometries(
     prior = np.asarray(given[tables.camera_idx[tables.pairs]].all(axis=1))
     undefined = configs == UNDEFINED
     configs[undefined] = np.where(prior[undefined], CALIBRATED, UNCALIBRATED)
-    # With given focal lengths the pose is estimated from the bearings, otherwise from the fundamental matrix.
-    guessed = unexplained[~prior[unexplained]]
-    matrices["F"][guessed] = F[~prior[unexplained]]
+    # With given focal lengths the pose is estimated from the bearings, otherwise from the fundamental matrix, as where
+    # more of the matches may be false.
+    guessed = ~prior[unexplained]
+    if of_inliers is not None:
+        guessed |= of_inliers[unexplained]
+    matrices["F"][unexplained[guessed]] = F[guessed]
     rotations, translations = tables.rotations.copy(), tables.translations.copy()
     rotations[unexplained], translations[unexplained] = np.nan, np.nan
-    doubtful = unexplained[shares < MIN_SHARE_AGREEING]
+    least = np.full(len(shares), MIN_SHARE_AGREEING)
+    if of_inliers is not None:
+        least[of_inliers[unexplained]] = MIN_SHARE_OF_INLIERS
+    doubtful = unexplained[shares < least]
     found = replace(tables, configs=configs, rotations=rotations, translations=translations, **matrices)
     caveat = (
         f"{len(unexplained)} of {len(tables.pairs)} pairs have no matrix that explains their matches; their two-view"
