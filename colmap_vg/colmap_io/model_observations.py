@@ -144,9 +144,14 @@ def _heads(content: bytes, starts: IntArray) -> NDArray[np.void]:
     return np.asarray(bytes_of_heads.view(np.dtype([("id", "<u8"), ("xyz", "<f8", 3)])).reshape(-1))
 
 
+def no_room() -> OutputError:
+    """The error where the temporary folder has no room for a model."""
+    return OutputError(
+        f"{tempfile.gettempdir()}: the model does not fit into the temporary folder. Free some space, or set TMPDIR to a"
+        " larger one."
+    )
+
+
 def _check_room(is_whole: bool) -> None:
     if not is_whole:
-        raise OutputError(
-            f"{tempfile.gettempdir()}: the model does not fit into the temporary folder. Free some space, or set TMPDIR"
-            " to a larger one."
-        )
+        raise no_room()

@@ -8,8 +8,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg.colmap_io.loading import with_other_images
-from colmap_vg.colmap_io.model_observations import keypoint_records
-from colmap_vg.errors import OutputError
+from colmap_vg.colmap_io.model_observations import keypoint_records, no_room
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -76,10 +75,7 @@ def with_points(
             (Path(folder) / "images.bin").write_bytes(content)
             (Path(folder) / "points3D.bin").write_bytes(points)
         except OSError as error:
-            raise OutputError(
-                f"{tempfile.gettempdir()}: the model does not fit into the temporary folder ({error}). Free some space,"
-                " or set TMPDIR to a larger one."
-            ) from error
+            raise no_room() from error
         model.read_binary(folder)
     with_other_images(model, cache)
     return model
