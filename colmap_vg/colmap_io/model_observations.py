@@ -147,8 +147,8 @@ def _heads(content: bytes, starts: IntArray) -> NDArray[np.void]:
 def no_room() -> OutputError:
     """The error where the temporary folder has no room for a model."""
     return OutputError(
-        f"{tempfile.gettempdir()}: the model does not fit into the temporary folder. Free some space, or set TMPDIR to a"
-        " larger one."
+        f"{tempfile.gettempdir()}: the model does not fit into the temporary folder. Free some space, or set TMPDIR to"
+        " a larger one."
     )
 
 
