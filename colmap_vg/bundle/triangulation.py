@@ -146,8 +146,6 @@ def _of_matched_pairs(tracks: _Rays, matches: IntArray, num_keypoints: int) -> t
     ends = ends[:, np.argsort(tracks.track[ends[0]], kind="stable")]
     starts = np.searchsorted(tracks.track[ends[0]], np.arange(t + 1))
     count = np.diff(starts)
-    by_image = np.lexsort((tracks.images, tracks.track))
-    sights = np.flatnonzero(_starts(tracks.track[by_image], tracks.images[by_image]))
     best, highest = np.zeros((3, t)), np.zeros(t)
     for number in range(NUM_HYPOTHESES):
         tried = np.flatnonzero(count > number)
@@ -164,8 +162,7 @@ def _of_matched_pairs(tracks: _Rays, matches: IntArray, num_keypoints: int) -> t
         )
         off, ahead = _deviations(tracks, positions)
         share = np.where(ahead, np.maximum(1.0 - off / np.sin(MAX_ANGLE) ** 2, 0.0), 0.0)
-        # Each image counts once.
-        score = np.bincount(tracks.track[by_image][sights], np.maximum.reduceat(share[by_image], sights), t)
+        score = np.bincount(tracks.track, share, t)
         better = score > highest
         best, highest = np.where(better, positions, best), np.where(better, score, highest)
     off, ahead = _deviations(tracks, best)

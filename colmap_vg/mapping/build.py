@@ -122,7 +122,7 @@ def triangulated(
 ) -> "pycolmap.Reconstruction":
     """Copy a model of poses with the points of its registered images, as a stage."""
     with log.stage("triangulate"):
-        model = with_triangulated_points(cache, reconstruction)
+        model = with_triangulated_points(cache, reconstruction, log)
         log.result(f"{model.num_points3D()} points")
     return model
 

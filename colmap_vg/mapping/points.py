@@ -10,7 +10,7 @@ from colmap_vg.bundle.tracks import MatchedRays
 from colmap_vg.bundle.triangulation import triangulate
 from colmap_vg.colmap_io.cameras import bearings_of_keypoints
 from colmap_vg.colmap_io.model_points import keypoints_of_images, with_points
-from colmap_vg.events import report_progress
+from colmap_vg.events import StageLog, report_progress
 from colmap_vg.mapping.options import MIN_TRIANGULATION_ANGLE_DEG
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ class _MatchedKeypoints:
 
 
 def with_triangulated_points(
-    cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction"
+    cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", log: StageLog | None = None
 ) -> "pycolmap.Reconstruction":
     """Copy a model of poses, and triangulate the points that its registered images have in common.
 
@@ -37,13 +37,15 @@ def with_triangulated_points(
         Its matches are used.
     reconstruction : pycolmap.Reconstruction
         With poses, no points.
+    log : StageLog, optional
+        Told of each image whose rays are computed.
 
     Returns
     -------
     pycolmap.Reconstruction
     """
     report_progress("tracks")
-    matched = _matched_keypoints(cache, reconstruction)
+    matched = _matched_keypoints(cache, reconstruction, log)
     report_progress("points")
     found = triangulate(matched.seen, np.radians(MIN_TRIANGULATION_ANGLE_DEG))
     report_progress("points")
@@ -59,7 +61,9 @@ def with_triangulated_points(
     )
 
 
-def _matched_keypoints(cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction") -> _MatchedKeypoints:
+def _matched_keypoints(
+    cache: "pycolmap.DatabaseCache", reconstruction: "pycolmap.Reconstruction", log: StageLog | None
+) -> _MatchedKeypoints:
     images = [reconstruction.image(image_id) for image_id in sorted(reconstruction.reg_image_ids())]
     pixels = keypoints_of_images(reconstruction)
     first = np.cumsum([0] + [len(pixels[image.image_id]) for image in images])
@@ -74,6 +78,8 @@ def _matched_keypoints(cache: "pycolmap.DatabaseCache", reconstruction: "pycolma
             reconstruction.camera(image.camera_id), pixels[image.image_id][matched[at]]
         )
         rays[:, own] = image.cam_from_world().rotation.matrix().T @ found.T
+        if log is not None:
+            log.progress(f"{row + 1} of {len(images)} images", (row + 1) / len(images), row + 1)
     matches = (np.cumsum(matched) - 1)[matches]
     matches = matches[:, usable[matches].all(axis=0)]
     image_row = np.repeat(np.arange(len(images)), np.diff(bounds))

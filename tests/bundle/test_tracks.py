@@ -85,3 +85,21 @@ def test_tracks_are_connected_components() -> None:
     assert found[7] == found[8] >= 0
     assert found[7] != found[0]
     assert (found[[1, 3, 4, 6, 9]] == -1).all()
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_change_of_inverse_depth_times_its_lever_is_an_angle_between_the_rays(side: int) -> None:
+    centers = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5]])
+    point = np.array([1.0, 0.0, 4.0])  # nearly ahead of the second camera, along the baseline of neither
+    rays = normalized(point - centers)
+    seen = MatchedRays(np.arange(2), rays.T.copy(), centers.T.copy(), np.array([[0], [1]]))
+    (inverse,), (lever,) = (pair[side] for pair in tracks._inverse_depths(seen, seen.matches))
+    assert inverse == pytest.approx(1.0 / np.linalg.norm(point - centers[side]))
+    angle, other = 1e-6, 1 - side
+    rays[other] += angle * np.cross([0.0, 1.0, 0.0], rays[other])  # in the plane of both rays
+    turned = MatchedRays(np.arange(2), rays.T.copy(), centers.T.copy(), seen.matches)
+    (moved,) = tracks._inverse_depths(turned, seen.matches)[0][side]
+    parallax = np.arccos(rays[0] @ rays[1])
+    # It is the sine of the angle that is linear in the inverse depth.
+    assert abs(moved - inverse) * lever == pytest.approx(angle, rel=0.2)
+    assert parallax < 0.4

@@ -99,3 +99,15 @@ def test_parts_that_nothing_links_move_as_the_step_says() -> None:
 def test_cameras_at_one_place_are_refused() -> None:
     with pytest.raises(GraphError, match="coincide"):
         gauged(np.ones((4, 3)))
+
+
+def test_the_last_image_does_not_jump_either_and_no_image_turns_beyond_a_radian() -> None:
+    cameras, edges = street(9)
+    step = np.zeros((9, 6))
+    step[8, 3:] = [0.0, 100.0, 0.0]
+    moved = CameraSteps(cameras, edges).taken(cameras, step.ravel(), NONE)
+    assert np.abs(moved.centers - cameras.centers).max() < 1.2 * (cameras.centers[1, 0] - cameras.centers[0, 0])
+    step = np.zeros((9, 6))  # a turn of the whole street about its first image
+    step[:, 1], step[:, 5] = -3.0, -3.0 * (cameras.centers[:, 0] - cameras.centers[0, 0])
+    moved = CameraSteps(cameras, edges).taken(cameras, step.ravel(), NONE)
+    np.testing.assert_allclose(so3.angle(moved.rotations), 1.0)

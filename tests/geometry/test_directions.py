@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from colmap_vg.geometry.directions import angle_between, normalized, tangent_basis
+from colmap_vg.geometry.directions import angle_between, norm_of_cross, normalized, tangent_basis
 
 UNIT = hnp.arrays(np.float64, (3,), elements=st.floats(-1.0, 1.0)).filter(lambda v: np.linalg.norm(v) > 1e-3)
 
@@ -28,6 +28,13 @@ def test_tangent_basis_at_the_poles():
     B = tangent_basis(poles)
     assert np.allclose(np.einsum("nai,naj->nij", B, B), np.eye(2), atol=1e-14)
     assert np.allclose(np.einsum("nai,na->ni", B, poles), 0.0, atol=1e-14)
+
+
+def test_angles_of_any_vectors_follow_from_their_cosines():
+    u, v = np.random.default_rng(0).standard_normal((2, 50, 3))
+    cosine = np.sum(u * v, axis=1) / (np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1))
+    np.testing.assert_allclose(angle_between(u, v), np.arccos(cosine), rtol=1e-9)
+    np.testing.assert_allclose(norm_of_cross(u, v), np.linalg.norm(np.cross(u, v), axis=1), rtol=1e-12)
 
 
 def test_angles_are_exact_near_zero_and_pi():

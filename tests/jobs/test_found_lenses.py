@@ -21,8 +21,8 @@ TERM, GUESS = -0.1, 1.2
 OPTIONS = MappingOptions(num_threads=1, extract_colors=False)
 
 
-def bend(path: Path) -> None:
-    """Distort the keypoints of a database, and let its camera know neither that nor the focal length."""
+def bend(path: Path, prior: bool) -> None:
+    """Distort the keypoints of a database without telling its camera, which knows its focal length or guesses it."""
     with pycolmap.Database.open(path) as database:
         camera = database.read_all_cameras()[0]
         f, x, y = camera.params
@@ -31,7 +31,12 @@ def bend(path: Path) -> None:
             pixels = database.read_keypoints(image.image_id)[:, :2].astype(np.float64)
             rays = np.concatenate([camera.cam_from_img(pixels), np.ones((len(pixels), 1))], axis=1)
             database.update_keypoints(image.image_id, np.asarray(lens.img_from_cam(rays), dtype=np.float32))
-        lens.camera_id, lens.params, lens.has_prior_focal_length = camera.camera_id, [GUESS * f, x, y, 0.0], False
+        lens.camera_id, lens.has_prior_focal_length = camera.camera_id, prior
+        lens.params = [f if prior else GUESS * f, x, y, 0.0]
+            camera.camera_id,
+            [f if prior else GUESS * f, x, y, 0.0],
+            prior,
+        )
         database.update_camera(lens)
 
 
@@ -41,12 +46,14 @@ def views() -> SyntheticViews:
 
 
 @pytest.fixture(scope="module")
-def databases(views: SyntheticViews, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def databases(views: SyntheticViews, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """With a known lens, and with distorted ones of an unknown and of a known focal length."""
     folder = tmp_path_factory.mktemp("lenses")
-    for name in ("known.db", "bent.db"):
+    for name in ("known.db", "bent.db", "stated.db"):
         write_synthetic_database(folder / name, views)
-    bend(folder / "bent.db")
-    return folder / "known.db", folder / "bent.db"
+    bend(folder / "bent.db", prior=False)
+    bend(folder / "stated.db", prior=True)
+    return folder / "known.db", folder / "bent.db", folder / "stated.db"
 
 
 def mean_error(found: MappingResult, views: SyntheticViews) -> float:
@@ -56,10 +63,11 @@ def mean_error(found: MappingResult, views: SyntheticViews) -> float:
     return float(align_positions(centers, views.projection_centers[ids - 1])[0].mean())
 
 
+@pytest.mark.parametrize("stated", [False, True])
 def test_a_distorted_lens_costs_little_accuracy_and_no_trust(
-    views: SyntheticViews, databases: tuple[Path, Path], tmp_path: Path
+    stated: bool, views: SyntheticViews, databases: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
-    known, bent = databases
+    known, bent = databases[0], databases[1 + stated]
     log = StageLog()
     found, calibrated = (
         map_database(bent, None, tmp_path / "b", OPTIONS, log),
@@ -88,8 +96,10 @@ def views_rotations(views: SyntheticViews, edges: np.ndarray) -> np.ndarray:
     return R[edges[:, 1]] @ np.swapaxes(R[edges[:, 0]], 1, 2)
 
 
-def test_only_solutions_with_distortion_that_few_pairs_agree_with_are_read_again(databases: tuple[Path, Path]) -> None:
-    known, bent = databases
+def test_only_solutions_with_distortion_that_few_pairs_agree_with_are_read_again(
+    databases: tuple[Path, Path, Path],
+) -> None:
+    known, bent, _ = databases
     graph = read_job_graph(known, OPTIONS, StageLog())
     assert lenses_to_read_with(graph, solve_job_graph(graph, OPTIONS, StageLog())) is None
     graph = read_job_graph(bent, OPTIONS, StageLog())
@@ -104,7 +114,7 @@ def test_only_solutions_with_distortion_that_few_pairs_agree_with_are_read_again
     assert lenses_to_read_with(graph, replace(solution, radial_terms=None)) is None
 
 
-def test_found_lenses_replace_the_cameras_and_the_matrices_of_their_pairs(databases: tuple[Path, Path]) -> None:
+def test_found_lenses_replace_the_cameras_and_the_matrices_of_their_pairs(databases: tuple[Path, Path, Path]) -> None:
     tables = read_tables(databases[1])
     second = pycolmap.Camera(tables.cameras[0].todict())
     second.camera_id, second.model, second.params = 2, pycolmap.CameraModelId.PINHOLE, [1000.0, 1000.0, 800.0, 600.0]
