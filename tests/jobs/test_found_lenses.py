@@ -33,10 +33,6 @@ def bend(path: Path, prior: bool) -> None:
             database.update_keypoints(image.image_id, np.asarray(lens.img_from_cam(rays), dtype=np.float32))
         lens.camera_id, lens.has_prior_focal_length = camera.camera_id, prior
         lens.params = [f if prior else GUESS * f, x, y, 0.0]
-            camera.camera_id,
-            [f if prior else GUESS * f, x, y, 0.0],
-            prior,
-        )
         database.update_camera(lens)
 
 
