@@ -93,6 +93,7 @@ def linearize(problem: BundleProblem, state: BundleState, loss_scale_px: float) 
     Parameters
     ----------
     problem : BundleProblem
+        With an observation at least.
     state : BundleState
     loss_scale_px : float
         Scale c of the loss ``c^2 log(1 + |r|^2 / c^2) / 2``.

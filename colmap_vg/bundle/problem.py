@@ -14,7 +14,7 @@ from colmap_vg.geometry import so3
 MAX_GROWTH = 2.0
 """Maximum change, either way, of the logarithm of a focal length or of a distance in one step."""
 OBSERVATIONS_PER_RUN = 8192
-"""Observations that are linearised at once."""
+"""Number of observations from which a run takes no further image."""
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -38,7 +38,7 @@ class Lens(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Observations of consecutive images with one lens, whose arrays fit in a processor's cache.
+    """Observations of consecutive images with one lens, few enough for a processor's cache unless one image has more.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class BundleProblem:
         return [slice(start, end) for start, end in pairwise(self.starts.tolist())]
 
     @cached_property
-    def runs(self) -> list["Run"]:
+    def runs(self) -> list[Run]:
         """Runs of images with one lens, of about `OBSERVATIONS_PER_RUN` observations each."""
         found, first = list[Run](), 0
         lenses = self.camera_idx.tolist()

@@ -59,9 +59,9 @@ class ReducedSystem:
     by_lens : (2, t, k) array
         Derivatives of the residuals by the unknowns of their lenses.
     by_point : (2, 3, k) array
-        Derivatives by points.
+        Derivatives by points, fixed or not.
     across : (2, 3, k) array
-        Those times ``L^-T``.
+        Those times ``L^-T``, zero for fixed points.
     factors : PointFactors
     of_points : (3, q) array
         Gradients of points times ``L^-1``.
@@ -98,7 +98,7 @@ class ReducedSystem:
             np.asarray(total, dtype=np.float64),
             found.rays,
             by_lens,
-            by_point,
+            found.by_point,
             across,
             factors,
             of_points,
@@ -153,7 +153,7 @@ class ReducedSystem:
         linear = self._changes(problem, step)
         moved = np.take(np.ascontiguousarray(shifts.T), problem.point_row, axis=1)
         bent = change - linear - np.einsum("abk,bk->ak", self.by_point, moved)
-        of_points = self.factors.lower(gradients(len(shifts), problem.point_row, self.by_point, bent))
+        of_points = gradients(len(shifts), problem.point_row, self.across, bent)
         left = bent - np.einsum("abk,bk->ak", self.across, np.take(of_points, problem.point_row, axis=1))
         gradient = np.zeros(len(self.gradient) + 1)
         for row, own in zip(problem.unknowns, problem.of_images, strict=True):

@@ -1,4 +1,4 @@
-"""Tracks of matched keypoints with known poses: false matches are dropped by the depths that each keypoint's tell.
+"""Tracks of matched keypoints with known poses; matches whose depth contradicts the others of a keypoint are dropped.
 
 A match tells how far along each of its two rays they meet. With rays u1, u2 and the vector b between the centres, the
 inverse depth along u1 is ``w = (1 - (u1 u2)^2) / (b u1 - (u1 u2)(b u2))``, and a change of it by dw is an angle of
@@ -45,13 +45,13 @@ class MatchedRays:
 
 
 def consistent_matches(seen: MatchedRays) -> BoolArray:
-    """Matches (e,) whose depths are the weighted median of both keypoints' matches, within `MAX_ANGLE`."""
+    """Matches (e,) whose inverse depths are within `MAX_ANGLE` of the weighted medians of both keypoints."""
     k, e = len(seen.image_row), seen.matches.shape[1]
     inverse, lever = np.empty((2, e), dtype=np.float32), np.empty((2, e), dtype=np.float32)
     for start in range(0, e, BLOCK):
         own = slice(start, start + BLOCK)
         inverse[:, own], lever[:, own] = _inverse_depths(seen, seen.matches[:, own])
-    medians = _weighted_medians(seen.matches.ravel(), inverse.ravel(), lever.ravel(), k)
+    medians = np.nan_to_num(_weighted_medians(seen.matches.ravel(), inverse.ravel(), lever.ravel(), k))
     consistent = np.ones(e, dtype=bool)
     for side, at in enumerate(seen.matches):
         with np.errstate(invalid="ignore"):
@@ -69,7 +69,8 @@ def _inverse_depths(seen: MatchedRays, matches: IntArray) -> tuple[Array, Array]
     sine = np.maximum(1.0 - cosine**2, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = sine / np.stack([along1 - cosine * along2, cosine * along1 - along2])
-    inverse[:, sine == 0.0] = 0.0  # parallel rays meet nowhere
+    # Parallel rays meet nowhere, and rays from one place tell no depth.
+    inverse[:, (sine == 0.0) | (squared == 0.0)] = 0.0
     levers = np.sqrt(np.maximum(squared - np.square([along2, along1]), 0.0))
     return inverse, levers
 

@@ -21,6 +21,8 @@ NUM_HYPOTHESES = 12
 """Number of matched pairs whose points are tried in a track that is not one point."""
 MAX_NUM_ROUNDS = 30
 """Maximum number of points that are taken from a track before what remains of it is given up."""
+NEAREST = 1e-12
+"""Least squared distance of a point from a centre, over the mean of all."""
 NUM_WEIGHTINGS = 2
 """Number of solutions for a point: the first weighs all rays alike, the next ones by the distances found before."""
 
@@ -183,14 +185,17 @@ def _again(tracks: _Rays, found: Array, fits: BoolArray) -> tuple[Array, BoolArr
 
 
 def nearest_points(rays: Array, centers: Array, track: IntArray, num_tracks: int) -> Array:
-    """Points (3, t) with the least squared sines of angles to rays (3, r) from centres (3, r), for each track (r,)."""
+    """Points (3, t) that nearly minimise the squared sines of angles to rays (3, r) from centres (3, r), by track."""
     count = np.maximum(np.bincount(track, minlength=num_tracks), 1)
     positions = sums_at_points(num_tracks, track, centers) / count
     weights = np.ones(len(track))
     for number in range(NUM_WEIGHTINGS):
         away = positions[:, track] - centers
         if number > 0:
-            weights = 1.0 / np.maximum(np.einsum("ak,ak->k", away, away), np.finfo(np.float64).tiny)
+            squared = np.einsum("ak,ak->k", away, away)
+            weights = 1.0 / np.maximum(
+                squared, NEAREST * squared.sum() / max(len(squared), 1) + np.finfo(np.float64).tiny
+            )
         # Across the ray: w (I - u u^T).
         x, y, z = rays
         products = np.stack([1.0 - x * x, -x * y, -x * z, 1.0 - y * y, -y * z, 1.0 - z * z])
@@ -224,7 +229,10 @@ def _starts(*keys: IntArray) -> BoolArray:
 
 
 def _is_wide(tracks: _Rays, fits: BoolArray, min_angle: float) -> BoolArray:
-    """Whether two rays (r,) that fit are apart by an angle in each track (t,): one, and the farthest one's farthest."""
+    """Whether two rays that fit are apart by an angle, and as far from opposite, in each track (t,).
+
+    Two sweeps find them: the ray nearest to a right angle with the first, and that nearest to a right angle with it.
+    """
     used = tracks.subset(fits)
     wide = np.zeros(tracks.num_tracks, dtype=bool)
     if not len(used.track):
@@ -233,7 +241,7 @@ def _is_wide(tracks: _Rays, fits: BoolArray, min_angle: float) -> BoolArray:
     place = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(used.track)))
     reference = used.rays[:, starts]
     for _ in range(2):
-        cosine = np.einsum("ak,ak->k", used.rays, reference[:, place])
+        cosine = np.abs(np.einsum("ak,ak->k", used.rays, reference[:, place]))
         least = np.minimum.reduceat(cosine, starts)
         farthest = np.flatnonzero(cosine == least[place])
         reference = used.rays[:, farthest[np.searchsorted(farthest, starts)]]

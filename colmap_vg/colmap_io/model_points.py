@@ -50,7 +50,8 @@ def with_points(
     positions : (q, 3) array
         World frame; the points get the ids 1 to q.
     point_row, image_ids, keypoint_idx : (k,) int64 array
-        Point, registered image, and index of the keypoint of each observation, sorted by point. Each point has one.
+        Point, registered image, and index of the keypoint of each observation, sorted by point. Each point has one
+        observation at least.
 
     Returns
     -------

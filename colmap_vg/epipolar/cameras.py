@@ -26,7 +26,7 @@ SHORTEST_BASELINE = 1e-6
 """Share of the RMS distance of cameras; keeps directions of coinciding cameras finite."""
 _MAX_TURN, _MAX_SHIFT = 0.2, 0.5
 """Maximum turn and shift of an image in one step, relative to the neighbour with which it agrees best: radians, and a
-share of the distance between them."""
+share of the distance between them at first, or of a tenth of the median distance."""
 _MAX_WHOLE_TURN = 1.0  # radians per step, of any image
 _MAX_LOG_FOCAL_STEP = 0.3  # change of a log focal length per step
 _MAX_RADIAL_STEP = 0.1  # change of the radial term per step

@@ -21,11 +21,11 @@ TOLERANCE_BEFORE_POINTS = 1e-3
 simulated ones the final errors differ by 0.6 % at most, whether it is this or 1e-5."""
 MATCHES_BEFORE_POINTS, TRACKS_BEFORE_POINTS = 60, 20
 """Maximum numbers of matches of a pair and of tracks of a triplet in jobs, where bundle adjustment decides the final
-poses: with more the errors of four sets of photographs and two simulated ones differ by 3 % at most, mostly upwards.
+poses: with more, the errors of four sets of photographs and two simulated ones change by 3 % at most; most grow.
 Ten tracks of a triplet do not suffice: the length of a street is then lost."""
 AGREEING_WITH_LENSES = 0.9
-"""Share of the inlier matches in pairs that agree with a solution below which they are estimated again, if it found
-distortion."""
+"""Relative poses are estimated again if a solution found distortion and a smaller share of the inlier matches than this
+lies in pairs that agree with it."""
 
 
 def read_job_graph(
@@ -81,15 +81,20 @@ def _wanted_priors(priors: PosePriors | None, options: MappingOptions) -> PosePr
     return priors
 
 
-def lenses_to_read_with(graph: ViewGraph, solution: PoseSolution) -> FoundLenses | None:
+def lenses_to_read_with(graph: ViewGraph, solution: PoseSolution, options: MappingOptions) -> FoundLenses | None:
     """Lenses to estimate pairs with again, where a solution found distortion and few of them agree; otherwise None."""
     terms, focal_lengths = solution.radial_terms, graph.camera_focal_lengths
     if terms is None or focal_lengths is None or not np.any(terms) or not solution.agreement:
         return None
+    if not options.ba_refine_extra_params or graph.camera_idx is None:
+        return None
     if solution.agreement[0].inliers >= AGREEING_WITH_LENSES and not solution.arrangements:
         return None
     before = np.zeros(len(terms)) if graph.found_radial_terms is None else graph.found_radial_terms
-    return FoundLenses(focal_lengths * solution.focal_scales, terms, before)
+    anew = np.zeros(graph.num_edges) if graph.verified_anew is None else graph.verified_anew.astype(np.float64)
+    cameras = graph.camera_idx[graph.edges].T.ravel()
+    verified, every = (np.bincount(cameras, w, len(terms)) for w in (np.tile(anew, 2), np.ones(len(cameras))))
+    return FoundLenses(focal_lengths * solution.focal_scales, terms, before, np.asarray(verified > 0.5 * every))
 
 
 def solve_job_graph(graph: ViewGraph, options: MappingOptions, log: StageLog) -> PoseSolution:

@@ -181,7 +181,7 @@ def _solved_models(
 ) -> tuple[ViewGraph, PoseSolution, list[BuiltModel]]:
     """Solve a viewing graph, read again if it has other lenses, and build the models of its components."""
     solution = solve_job_graph(graph, options, log)
-    if lenses := lenses_to_read_with(graph, solution):
+    if lenses := lenses_to_read_with(graph, solution, options):
         log.warn(
             "The matches tell of distortion that the database's lenses do not have: the relative poses are estimated"
             " again with it."

@@ -130,6 +130,7 @@ def triangulated(
 def settle_given_poses(mapper: "pycolmap.IncrementalMapper", options: MappingOptions, held: Held) -> None:
     """Fit given poses and newly triangulated points to each other; where poses are held, keep the points that fit."""
     if held.frames:
+        mapper.complete_and_merge_tracks(triangulator_options(options))
         _filter(mapper)
     else:
         _adjust_to_convergence(mapper, options, held)

@@ -98,8 +98,8 @@ def _read(
     """Graph of the pairs of the tables; marked cameras (c,) keep their calibration."""
     terms, found = np.zeros(len(tables.cameras)), np.zeros(len(tables.cameras), dtype=bool)
     if lenses is not None:
-        tables, terms, found = with_found_lenses(tables, lenses)
-    with_lens = found.copy()
+        tables, terms, found = with_found_lenses(tables, database_path, lenses)
+    of_inliers = found.copy() if lenses is None else found & ~lenses.verified_anew
     report_progress("distortion")
     if options.find_distortion:
         tables, more = with_found_distortion(tables, database_path, calibrated | found)
@@ -110,9 +110,9 @@ def _read(
     report_progress("still background")
     tables, thinned = without_still_background(tables, database_path)
     report_progress("verification")
-    of_inliers = np.asarray(with_lens[tables.camera_idx[tables.pairs]].any(axis=1)) & ~thinned
     expected = thinned | (found | (terms != 0.0))[tables.camera_idx[tables.pairs]].any(axis=1)
-    tables, changed = with_verified_geometries(tables, options.random_seed, expected, of_inliers)
+    inliers = np.asarray(of_inliers[tables.camera_idx[tables.pairs]].any(axis=1)) & ~thinned
+    tables, changed = with_verified_geometries(tables, options.random_seed, expected, inliers)
     changed |= thinned
     report_progress("focal lengths")
     focals = decide_focal_lengths(tables, options, calibrated, found)

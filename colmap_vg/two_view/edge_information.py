@@ -90,7 +90,8 @@ def refine_relative_poses(
     focal_lengths1, focal_lengths2 : (m,) array
         Focal lengths of each edge's cameras, pixels.
     max_num_steps : int
-        Most steps per edge, all rounds together; an edge stops when its cost does.
+        Most steps per edge, all rounds together, rounded up to a multiple of their number; with none the poses stay. An
+        edge stops when its cost does.
 
     Returns
     -------

@@ -87,6 +87,30 @@ def test_a_correction_is_that_of_the_whole_dense_problem() -> None:
     np.testing.assert_allclose(found * size, expected * size, atol=1e-4 * np.abs(expected * size).max())
 
 
+def test_changes_and_corrections_with_fixed_points_are_those_of_the_dense_problem() -> None:
+    problem, truth = scene(num_points=25, num_lenses=2, sigma_px=0.5, seen=0.9)
+    problem = replace(problem, fixed=np.arange(25) % 3 == 0)
+    state, damping = displaced(problem, truth, 1e-3), 0.01
+    J, _ = jacobian(problem, state, 2.0)
+    u, rng = problem.num_unknowns, np.random.default_rng(0)
+    J[:, u:][:, np.repeat(problem.fixed, 3)] = 0.0
+    step, bend = rng.normal(size=u), rng.normal(size=len(J))
+    shifts = np.where(problem.fixed[:, None], 0.0, rng.normal(size=state.points.shape))
+    system = ReducedSystem.of(problem, ReducedPattern(problem), state, linearize(problem, state, 2.0))
+    np.testing.assert_allclose(system._changes(problem, step).T.ravel(), J[:, :u] @ step, rtol=1e-5, atol=1e-5)
+    change = bend + J @ np.concatenate([step, shifts.ravel()])
+    used = np.concatenate([np.ones(u, dtype=bool), np.repeat(~problem.fixed, 3)])
+    H = J[:, used].T @ J[:, used]
+    reduced = H[:u, :u] - H[:u, u:] @ np.linalg.solve(H[u:, u:], H[u:, :u])
+    level = np.zeros(len(H))
+    level[:u] = (damping + MIN_DAMPING) * np.diag(reduced)
+    expected = -np.linalg.solve(H + np.diag(level), J[:, used].T @ bend)
+    more, further = system.correction(problem, step, shifts, change.reshape(-1, 2).T, damping)
+    size, found = np.sqrt(np.diag(H)), np.concatenate([more, further[~problem.fixed].ravel()])
+    np.testing.assert_allclose(found * size, expected * size, atol=1e-4 * np.abs(expected * size).max())
+    assert not further[problem.fixed].any()
+
+
 def test_changes_of_residuals_have_the_weights_of_where_they_start() -> None:
     problem, truth = scene(seen=1.0, sigma_px=0.5)
     one = linearize(problem, displaced(problem, truth, 1e-3), 1.0)

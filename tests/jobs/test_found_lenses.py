@@ -97,17 +97,24 @@ def test_only_solutions_with_distortion_that_few_pairs_agree_with_are_read_again
 ) -> None:
     known, bent, _ = databases
     graph = read_job_graph(known, OPTIONS, StageLog())
-    assert lenses_to_read_with(graph, solve_job_graph(graph, OPTIONS, StageLog())) is None
+    assert lenses_to_read_with(graph, solve_job_graph(graph, OPTIONS, StageLog()), OPTIONS) is None
     graph = read_job_graph(bent, OPTIONS, StageLog())
     solution = solve_job_graph(graph, OPTIONS, StageLog())
-    lenses = lenses_to_read_with(graph, solution)
+    lenses = lenses_to_read_with(graph, solution, OPTIONS)
     assert lenses is not None
     assert lenses.focal_lengths == pytest.approx(views_focal(known), rel=0.01)
     agreement = (replace(solution.agreement[0], inliers=0.95),)
-    assert lenses_to_read_with(graph, replace(solution, agreement=agreement, arrangements=())) is None
+    assert lenses_to_read_with(graph, replace(solution, agreement=agreement, arrangements=()), OPTIONS) is None
     several = (solution.cam_from_world_rotations,) * 2
-    assert lenses_to_read_with(graph, replace(solution, agreement=agreement, arrangements=several)) is not None
-    assert lenses_to_read_with(graph, replace(solution, radial_terms=None)) is None
+    assert lenses_to_read_with(graph, replace(solution, agreement=agreement, arrangements=several), OPTIONS) is not None
+    assert lenses_to_read_with(graph, replace(solution, radial_terms=None), OPTIONS) is None
+    fixed = replace(OPTIONS, ba_refine_extra_params=False)
+    assert lenses_to_read_with(graph, solution, fixed) is None
+    assert not lenses.verified_anew.any()
+    anew = replace(graph, verified_anew=np.arange(graph.num_edges) % 3 > 0)
+    again = lenses_to_read_with(anew, solution, OPTIONS)
+    assert again is not None
+    assert again.verified_anew.all()
 
 
 def test_found_lenses_replace_the_cameras_and_the_matrices_of_their_pairs(databases: tuple[Path, Path, Path]) -> None:
@@ -117,8 +124,10 @@ def test_found_lenses_replace_the_cameras_and_the_matrices_of_their_pairs(databa
     camera_idx = np.arange(36) % 2
     two = replace(tables, cameras=(*tables.cameras, second), camera_idx=camera_idx)
     f = tables.cameras[0].params[0]
-    lenses = FoundLenses(np.array([0.8 * f, 1000.0]), np.array([-0.08, 0.3]), np.array([-0.02, 0.0]))
-    found, terms, changed = with_found_lenses(two, lenses)
+    lenses = FoundLenses(
+        np.array([0.8 * f, 1000.0]), np.array([-0.08, 0.3]), np.array([-0.02, 0.0]), np.zeros(2, dtype=bool)
+    )
+    found, terms, changed = with_found_lenses(two, databases[1], lenses)
     assert changed.tolist() == [True, False]
     # Terms grow with the square of the focal length; a pinhole camera has none.
     assert terms.tolist() == pytest.approx([-0.02 - 0.08 / 0.64, 0.0])
@@ -128,3 +137,9 @@ def test_found_lenses_replace_the_cameras_and_the_matrices_of_their_pairs(databa
     assert np.isnan(found.F[of_first]).all()
     np.testing.assert_array_equal(found.F[~of_first], two.F[~of_first])
     assert np.isfinite(two.F).all()
+    np.testing.assert_array_equal(found.matches, two.matches)
+    cut = replace(two, matches=two.matches[::2].copy(), offsets=(two.offsets + 1) // 2)
+    for anew in (False, True):
+        seen, _, _ = with_found_lenses(cut, databases[1], replace(lenses, verified_anew=np.array([anew, True])))
+        sizes = np.where(of_first & anew, np.diff(two.offsets), np.diff(cut.offsets))
+        np.testing.assert_array_equal(np.diff(seen.offsets), sizes)
