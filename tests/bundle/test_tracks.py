@@ -103,3 +103,15 @@ def test_a_change_of_inverse_depth_times_its_lever_is_an_angle_between_the_rays(
     # It is the sine of the angle that is linear in the inverse depth.
     assert abs(moved - inverse) * lever == pytest.approx(angle, rel=0.2)
     assert parallax < 0.4
+
+
+@pytest.mark.filterwarnings("error")
+def test_rays_from_one_place_contradict_nothing() -> None:
+    """As those of the sensors of a cube: the third image tells the depth, and the two agree with any."""
+    point = np.array([0.0, 1.0, 8.0])
+    centers = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    rays = normalized(point - centers)
+    matches = np.array([[0, 0], [1, 2]])
+    assert consistent_matches(MatchedRays(np.arange(3), rays.T.copy(), centers.T.copy(), matches)).all()
+    alone = MatchedRays(np.arange(3), rays.T.copy(), centers.T.copy(), matches[:, :1])
+    assert consistent_matches(alone).all()
