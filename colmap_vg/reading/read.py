@@ -99,7 +99,7 @@ def _read(
     terms, found = np.zeros(len(tables.cameras)), np.zeros(len(tables.cameras), dtype=bool)
     if lenses is not None:
         tables, terms, found = with_found_lenses(tables, database_path, lenses)
-    of_inliers = found.copy() if lenses is None else found & ~lenses.verified_anew
+    verified, unverified = found.copy(), np.zeros_like(found) if lenses is None else found & lenses.verified_anew
     report_progress("distortion")
     if options.find_distortion:
         tables, more = with_found_distortion(tables, database_path, calibrated | found)
@@ -111,7 +111,8 @@ def _read(
     tables, thinned = without_still_background(tables, database_path)
     report_progress("verification")
     expected = thinned | (found | (terms != 0.0))[tables.camera_idx[tables.pairs]].any(axis=1)
-    inliers = np.asarray(of_inliers[tables.camera_idx[tables.pairs]].any(axis=1)) & ~thinned
+    cameras = tables.camera_idx[tables.pairs]
+    inliers = verified[cameras].any(axis=1) & ~unverified[cameras].any(axis=1) & ~thinned
     tables, changed = with_verified_geometries(tables, options.random_seed, expected, inliers)
     changed |= thinned
     report_progress("focal lengths")

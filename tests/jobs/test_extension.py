@@ -14,12 +14,14 @@ from typer.testing import CliRunner
 
 from colmap_vg import MappingOptions, align_positions, view_graph_mapping
 from colmap_vg.cli.main import app
+from colmap_vg.colmap_io.reconstruction import loaded_cache
 from colmap_vg.errors import DataFileError
 from colmap_vg.events import StageLog
 from colmap_vg.geometry import so3
 from colmap_vg.jobs.mapper import map_database
 from colmap_vg.mapping import build, extension
 from colmap_vg.mapping.build import finish_registration
+from colmap_vg.mapping.options import triangulator_options
 from colmap_vg.simulation.database import write_synthetic_database
 from colmap_vg.simulation.views import FOCAL_PX, HEIGHT, WIDTH, SyntheticViews, synthetic_views
 
@@ -309,6 +311,11 @@ def test_exact_known_poses_are_kept(scene: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(centers(model, ["00007.jpg"])[0], views.projection_centers[7], atol=1e-9)
     assert model.num_points3D() > 3000
     assert model.compute_mean_reprojection_error() < 1.0
+    with loaded_cache(scene / "all.db", tmp_path, 15) as (cache, _):
+        mapper, count = pycolmap.IncrementalMapper(cache), model.compute_num_observations()
+        mapper.begin_reconstruction(model)
+        mapper.complete_and_merge_tracks(triangulator_options(OPTIONS))
+    assert model.compute_num_observations() - count < 0.001 * count  # tracks are complete: 0.006 were missing
 
 
 def test_calibrations_of_another_image_size_are_refused(scene: Path, tmp_path: Path) -> None:
