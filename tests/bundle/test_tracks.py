@@ -111,7 +111,7 @@ def test_rays_from_one_place_contradict_nothing() -> None:
     point = np.array([0.0, 1.0, 8.0])
     centers = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     rays = normalized(point - centers)
-    rays[1] = normalized(rays[1:2] + [[1e-3, 0.0, 0.0]])[0]
+    rays[1] = normalized(rays[1] + np.array([1e-3, 0.0, 0.0]))
     matches = np.array([[0, 0], [1, 2]])
     assert consistent_matches(MatchedRays(np.arange(3), rays.T.copy(), centers.T.copy(), matches)).all()
     alone = MatchedRays(np.arange(3), rays.T.copy(), centers.T.copy(), matches[:, :1])

@@ -127,8 +127,9 @@ def test_keypoints_without_matches_and_none_at_all() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_a_point_at_a_projection_centre_does_not_overflow() -> None:
-    centers = np.array([[-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
-    rays = normalized(centers[1] - centers)
-    rays[1::2] = [0.0, 0.0, 1.0]
-    found = nearest_points(rays.T.copy(), centers.T.copy(), np.zeros(4, dtype=np.int64), 1)
-    np.testing.assert_allclose(found[:, 0], centers[1], atol=1e-9)
+    centers = np.zeros((8, 3))
+    centers[:2, 0] = [-1.0, 1.0]
+    rays = np.tile([0.0, 0.0, 1.0], (8, 1))
+    rays[:2] = -centers[:2]
+    found = nearest_points(rays.T.copy(), centers.T.copy(), np.zeros(8, dtype=np.int64), 1)
+    np.testing.assert_allclose(found[:, 0], 0.0, atol=1e-9)
