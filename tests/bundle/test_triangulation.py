@@ -129,7 +129,7 @@ def test_keypoints_without_matches_and_none_at_all() -> None:
 def test_a_point_at_a_projection_centre_does_not_overflow() -> None:
     centers = np.zeros((8, 3))
     centers[:2, 0] = [-1.0, 1.0]
-    rays = np.tile([0.0, 0.0, 1.0], (8, 1))
+    rays = np.tile(normalized(np.array([1.0, 2.0, 3.0])), (8, 1))
     rays[:2] = -centers[:2]
     found = nearest_points(rays.T.copy(), centers.T.copy(), np.zeros(8, dtype=np.int64), 1)
     np.testing.assert_allclose(found[:, 0], 0.0, atol=1e-9)
