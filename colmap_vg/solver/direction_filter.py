@@ -18,9 +18,8 @@ from colmap_vg.positions.result import centered, spread, unit_weights
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-LUD_ITERATIONS = 15
-"""Reweighting iterations of LUD, with a Newton step each: on rings, grids, lines and random graphs of 50 to 600 cameras
-with 10 to 40 % outliers as many verdicts are right as with four steps each, which take half as long again."""
+LUD_TOLERANCE = 1e-2
+"""Relative duality gap of LUD: initial positions need no more."""
 SCALES_DEG = (20.0, 14.0, 10.0, 7.0, 5.0)
 """Successive Geman-McClure scales, degrees; the last is COLMAP's default for rotations."""
 ITERATIONS_PER_SCALE = 6
@@ -54,14 +53,7 @@ def robust_direction_residuals(
         The graph is not connected.
     """
     w = unit_weights(weights, len(edges))
-    p = solve_lud(
-        num_images,
-        edges,
-        directions_world,
-        w,
-        max_num_iterations=LUD_ITERATIONS,
-        max_inner_iterations=1,
-    ).projection_centers
+    p = solve_lud(num_images, edges, directions_world, w, tolerance=LUD_TOLERANCE).projection_centers
     size = spread(p)
     system = LaplacianSystem(num_images, edges)
     for scale in np.repeat(2.0 * np.sin(np.radians(SCALES_DEG) / 2.0), ITERATIONS_PER_SCALE):
