@@ -3,10 +3,13 @@
 Zhuang, Cheong & Lee, "Baseline Desensitizing in Translation Averaging", CVPR 2018, in their bilinear form. The scale s
 of each edge is its inverse length, so that long baselines have no more weight than short ones. With the optimal
 ``s = max(gamma . d, 0) / ||d||²``, ``d = p_j - p_i``, the residual is the sine of the angle up to 90 degrees and 1
-beyond. As published, initial positions come from a few reweighting iterations on the unsquared distance perpendicular
-to the directions (their revised LUD, the objective of ShapeFit). Outer iterations then update the weights of rho, and
-inner iterations alternate between s and positions, both in closed form. The gauge is ``sum p = 0`` and
-``sum gamma . (p_j - p_i) = m``.
+beyond. Rounds update the weights of rho, and inner iterations alternate between s and positions, both in closed form.
+The gauge is ``sum p = 0`` and ``sum gamma . (p_j - p_i) = m``.
+
+As published, the iteration ends after ten rounds. It should: angles do not tell how far away a camera is whose edges
+contradict each other, and on graphs of photo collections the minimum has some at infinity, towards which a hundred
+rounds move them. Initial positions are those of LUD; the published ones, from the objective of ShapeFit, collapse on
+such graphs.
 """
 
 import numpy as np
@@ -15,8 +18,8 @@ from numpy.typing import NDArray
 from colmap_vg.linear.anderson import fixed_point
 from colmap_vg.linear.laplacian import LaplacianSystem
 from colmap_vg.linear.robust_losses import cauchy_loss, cauchy_weight
+from colmap_vg.positions.lud import solve_lud
 from colmap_vg.positions.result import PositionResult, centered, check_connected, spread, unit_weights
-from colmap_vg.positions.shapefit import solve_shapefit
 from colmap_vg.scene.solution import LogEntry
 
 Array = NDArray[np.float64]
@@ -24,10 +27,8 @@ IntArray = NDArray[np.int64]
 
 ROBUST_SCALE = 0.1
 """Scale of the Cauchy loss, a sine: 5.7 degrees; the paper's threshold."""
-START_ITERATIONS = 10
-"""Iterations of ShapeFit for the initial positions."""
-NUM_INNER = 10
-"""Inner iterations per outer iteration."""
+NUM_ROUNDS, NUM_INNER = 10, 10
+"""Rounds as published, and inner iterations of each."""
 MIN_RELATIVE_LENGTH = 1e-8
 """Lower limit of edge lengths as a share of the root mean square distance from the centroid: s stays finite."""
 
@@ -39,7 +40,7 @@ def solve_bata(
     weights: Array | None = None,
     *,
     initial_centers: Array | None = None,
-    max_num_iterations: int = 500,
+    max_num_iterations: int = NUM_ROUNDS,
     tolerance: float = 1e-8,
 ) -> PositionResult:
     """Solve for positions that minimise robust angular residuals.
@@ -54,16 +55,17 @@ def solve_bata(
     weights : (m,) array, optional
         Multipliers of the robust losses, default 1.
     initial_centers : (n, 3) array, optional
-        Initial positions. Default: those of the paper.
+        Initial positions, default those of LUD.
     max_num_iterations : int
-        Maximum number of outer iterations. The paper stops after 10.
+        Maximum number of rounds, default the paper's.
     tolerance : float
-        Relative change of positions in an outer iteration below which the iteration ends.
+        Relative change of positions in a round below which the iteration ends.
 
     Returns
     -------
     PositionResult
-        `lambdas` are the lengths ``1 / s``, infinite for edges that point backwards.
+        `lambdas` are the lengths ``1 / s``, infinite for edges that point backwards. It counts as converged after the
+        paper's number of rounds.
 
     Raises
     ------
@@ -73,9 +75,7 @@ def solve_bata(
     check_connected(num_images, edges)
     w, gamma = unit_weights(weights, len(edges)), directions_world
     if initial_centers is None:
-        initial_centers = solve_shapefit(
-            num_images, edges, gamma, w, max_num_iterations=START_ITERATIONS
-        ).projection_centers
+        initial_centers = solve_lud(num_images, edges, gamma, w).projection_centers
     problem = _Bata(num_images, edges, gamma)
     log: list[LogEntry] = []
 
@@ -92,14 +92,14 @@ def solve_bata(
     p, count, converged = fixed_point(
         outer,
         problem.gauged(initial_centers),
-        accelerate=True,
+        accelerate=False,
         max_num_iterations=max_num_iterations,
         tolerance=tolerance,
         on_iteration=note,
     )
     scales = problem.scales(p)
     lambdas = np.where(scales > 0, 1.0 / np.where(scales > 0, scales, 1.0), np.inf)
-    return PositionResult(p, lambdas, log[-1].cost, count, converged, tuple(log))
+    return PositionResult(p, lambdas, log[-1].cost, count, converged or count >= NUM_ROUNDS, tuple(log))
 
 
 class _Bata:

@@ -10,7 +10,6 @@ al.).
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_vg.linear.anderson import fixed_point
 from colmap_vg.linear.assembly import BlockPattern
 from colmap_vg.linear.solvers import factorize
 from colmap_vg.positions.result import PositionResult, check_connected, unit_weights
@@ -19,6 +18,8 @@ from colmap_vg.scene.solution import LogEntry
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+PATIENCE = 10
+"""Number of reweighting iterations without a lower cost or a smaller change after which the iteration ends."""
 DAMPING = 1e-10
 """Share of the mean diagonal added before factorisation, since the matrix is singular along translations."""
 MIN_RELATIVE_LENGTH = 1e-3
@@ -73,12 +74,12 @@ def solve_cross(
     check_connected(num_images, edges)
     w, gamma = unit_weights(weights, len(edges)), directions_world
     i, j = edges[:, 0], edges[:, 1]
-    smallest = _SmallestVector(num_images, edges)
+    vectors = _SmallestVector(num_images, edges)
     normal = w[:, None, None] * (np.eye(3) - gamma[:, :, None] * gamma[:, None, :])
     log: list[LogEntry] = []
 
     def least_squares(edge_weights: Array) -> Array:
-        p = smallest.find(edge_weights[:, None, None] * normal)
+        p = vectors.find(edge_weights[:, None, None] * normal)
         ahead = float(np.sum(w * np.sign(np.einsum("ka,ka->k", gamma, p[j] - p[i]))))
         return -p if ahead < 0 else p
 
@@ -86,26 +87,20 @@ def solve_cross(
         length = np.linalg.norm(p[j] - p[i], axis=1)
         return least_squares(1.0 / np.maximum(length, MIN_RELATIVE_LENGTH * np.median(length)) ** 2)
 
-    start = least_squares(np.ones(len(edges)))
-    best = [(sine_cost(start, edges, gamma, w), start)]
-
-    def note(iteration: int, p: Array, change: float) -> None:
-        log.append(LogEntry("cross", iteration, sine_cost(p, edges, gamma, w), change))
-        if log[-1].cost < best[0][0]:
-            best[0] = (log[-1].cost, p)
-
-    p, count, converged = fixed_point(
-        reweight,
-        start,
-        accelerate=False,
-        max_num_iterations=max_num_iterations,
-        tolerance=tolerance,
-        on_iteration=note,
-    )
-    cost = log[-1].cost
-    if not converged:
-        cost, p = best[0]
-    return PositionResult(p, np.linalg.norm(p[j] - p[i], axis=1), cost, count, converged, tuple(log))
+    best = p = least_squares(np.ones(len(edges)))
+    least, smallest_change, progress_at, converged = sine_cost(p, edges, gamma, w), np.inf, 0, False
+    for iteration in range(1, max_num_iterations + 1):
+        last, p = p, reweight(p)
+        change, cost = float(np.linalg.norm(p - last)), sine_cost(p, edges, gamma, w)
+        log.append(LogEntry("cross", iteration, cost, change))
+        converged = change <= tolerance
+        if cost < least or change < smallest_change:
+            smallest_change, progress_at = min(change, smallest_change), iteration
+        if cost < least or converged:
+            best, least = p, cost
+        if converged or iteration >= progress_at + PATIENCE:
+            break
+    return PositionResult(best, np.linalg.norm(best[j] - best[i], axis=1), least, len(log), converged, tuple(log))
 
 
 def sine_cost(p: Array, edges: IntArray, directions: Array, w: Array) -> float:

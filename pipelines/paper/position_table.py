@@ -14,7 +14,7 @@ from colmap_vg.solver.solve import solve_view_graph
 from paper.markdown import markdown_table
 from paper.scenes import KnownScene
 
-PAPER_METHODS: tuple[Method, ...] = ("cross", "cls", "lud", "1C", "1O", "2C", "2O")
+PAPER_METHODS: tuple[Method, ...] = ("cross", "cls", "shapefit", "lud", "bata", "1C", "1O", "2C", "2O")
 EARLIER_METHODS = ("cls", "cross")
 """What the paper's methods are to beat."""
 TABLE_TOLERANCE, TABLE_ITERATIONS = 1e-4, 300

@@ -24,7 +24,7 @@ def _objective(problem, p, weights):
 def test_result_is_a_minimum_of_the_robust_sines(seed):
     problem = ring_problem(15, 6, direction_sigma=0.05, seed=seed)
     weights = np.random.default_rng(seed).uniform(0.3, 2.0, len(problem.edges))
-    result = solve_bata(*problem.measured, weights, tolerance=1e-11)
+    result = solve_bata(*problem.measured, weights, max_num_iterations=2000, tolerance=1e-11)
     p = result.projection_centers
     assert result.converged
     assert result.cost == pytest.approx(_objective(problem, p, weights), rel=1e-9)
@@ -76,3 +76,12 @@ def test_gauge():
     p = solve_bata(*problem.measured).projection_centers
     d = p[problem.edges[:, 1]] - p[problem.edges[:, 0]]
     assert np.sum(d * problem.directions) == pytest.approx(len(d), rel=1e-12)
+
+
+def test_ten_rounds_as_published():
+    problem = ring_problem(60, 8, direction_sigma=0.03, outlier_share=0.3, seed=2)
+    result = solve_bata(*problem.measured)
+    assert result.num_iterations == 10
+    assert result.converged
+    assert result.log[-1].change > 1e-8
+    assert not solve_bata(*problem.measured, max_num_iterations=9).converged

@@ -77,3 +77,14 @@ def test_sparse_factors_find_the_same_vector():
     result = solve_cross(*problem.measured)
     truth = problem.centers - problem.centers.mean(axis=0)
     assert np.abs(result.projection_centers - truth / np.linalg.norm(truth)).max() < 1e-9
+
+
+def test_reweighting_that_gains_nothing_ends():
+    problem = ring_problem(60, 8, direction_sigma=0.1, outlier_share=0.5, seed=1)
+    result = solve_cross(*problem.measured)
+    assert not result.converged
+    assert result.num_iterations < 100
+    costs, changes = np.array([[entry.cost, entry.change] for entry in result.log]).T
+    assert costs[-10:].min() >= costs.min()
+    assert changes[-10:].min() >= changes.min()
+    assert result.cost <= costs.min()
