@@ -11,6 +11,7 @@ from collections import Counter
 
 import numpy as np
 import pycolmap
+from benchmark.rotation_averaging import averaged_by_pycolmap
 from numpy.typing import NDArray
 
 from colmap_vg import SolutionStatus, solve_view_graph
@@ -47,24 +48,7 @@ def errors_deg(rotations: Array, truth: Array) -> Array:
 def by_pycolmap(scene: SyntheticScene) -> tuple[NDArray[np.int64], Array]:
     """Rows of the images that ``pycolmap.run_rotation_averaging`` registers, and their rotations."""
     graph = scene.graph
-    reconstruction, pose_graph = pycolmap.Reconstruction(), pycolmap.PoseGraph()
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1000, height=1000, params=[1000, 500, 500], camera_id=1)
-    reconstruction.add_camera_with_trivial_rig(camera)
-    for image_id in graph.image_ids.tolist():
-        image = pycolmap.Image(name=f"{image_id}.jpg", camera_id=1, image_id=image_id)
-        reconstruction.add_image_with_trivial_frame(image)
-    for (i, j), R, direction, count in zip(
-        graph.image_ids[graph.edges].tolist(),
-        graph.cam2_from_cam1_rotations,
-        graph.cam2_in_cam1_directions,
-        graph.num_inliers.tolist(),
-        strict=True,
-    ):
-        edge = pycolmap.PoseGraphEdge()
-        edge.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ direction)
-        edge.num_matches = count
-        pose_graph.add_edge(i, j, edge)
-    pycolmap.run_rotation_averaging(pycolmap.RotationEstimatorOptions(), pose_graph, reconstruction, [])
+    reconstruction, _ = averaged_by_pycolmap(graph)
     ids = np.array(sorted(reconstruction.reg_image_ids()), dtype=np.int64)
     rotations = [reconstruction.image(i).cam_from_world().rotation.matrix() for i in ids.tolist()]
     return np.searchsorted(graph.image_ids, ids), np.array(rotations).reshape(-1, 3, 3)

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from paper.markdown import markdown_table
 
+from benchmark.rotation_averaging import averaged_by_pycolmap
 from colmap_vg.options import SolveOptions
 from colmap_vg.scene.view_graph import ViewGraph
 from colmap_vg.simulation.ring_scenes import SyntheticScene, ring_cameras, scene_from_poses
@@ -63,24 +63,4 @@ def timed_solve(graph: ViewGraph) -> float:
 
 def timed_rotation_averaging(graph: ViewGraph) -> float:
     """Seconds of ``pycolmap.run_rotation_averaging`` alone on the same relative rotations."""
-    reconstruction, pose_graph = pycolmap.Reconstruction(), pycolmap.PoseGraph()
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1000, height=1000, params=[1000, 500, 500], camera_id=1)
-    reconstruction.add_camera_with_trivial_rig(camera)
-    for image_id in graph.image_ids.tolist():
-        image = pycolmap.Image(name=f"{image_id}.jpg", camera_id=1, image_id=image_id)
-        reconstruction.add_image_with_trivial_frame(image)
-    counts = np.full(graph.num_edges, 100) if graph.num_inliers is None else graph.num_inliers
-    seen: set[tuple[int, int]] = set()
-    for (i, j), R, count in zip(
-        graph.image_ids[graph.edges].tolist(), graph.cam2_from_cam1_rotations, counts.tolist(), strict=True
-    ):
-        if (min(i, j), max(i, j)) in seen:  # it takes no second edge between two images
-            continue
-        seen.add((min(i, j), max(i, j)))
-        edge = pycolmap.PoseGraphEdge()
-        edge.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(R), np.zeros(3))
-        edge.num_matches = count
-        pose_graph.add_edge(i, j, edge)
-    start = time.perf_counter()
-    pycolmap.run_rotation_averaging(pycolmap.RotationEstimatorOptions(), pose_graph, reconstruction, [])
-    return time.perf_counter() - start
+    return averaged_by_pycolmap(graph)[1]
