@@ -1,7 +1,8 @@
 """Tables and figures of the paper: ``python pipelines/paper_tables.py --topology FOLDER --output_path OUT``.
 
 On 1DSfM folders with truth (``--data FOLDER ...``, each with EGs.txt and gt_bundle.out), or on cameras simulated on the
-topologies of real sets (``--topology``). Writes Markdown, CSV and SVG to OUT/tables.
+topologies of real sets (``--topology``). ``--real_edges FOLDER ...`` adds the noise of real edges without truth. Writes
+Markdown, CSV and SVG to OUT/tables.
 """
 
 import argparse
@@ -14,11 +15,14 @@ from pathlib import Path
 from typing import get_args
 
 from paper.noise_ratios import NUM_RATIO_SEEDS
-from paper.position_table import PAPER_METHODS
+from paper.position_table import DEFAULT_METHOD, TABLE_METHODS
+from paper.real_edges import edge_noise
+from paper.scene_reports import SceneJob, SceneReport, measure_or_load
 from paper.scenes import TABLE_1_SETS, set_conditions
-from paper.tables import SceneJob, SceneReport, measure_or_load, refuse_tables, write_tables
+from paper.tables import refuse_tables, write_tables
 
 import colmap_vg
+from colmap_vg.datasets.one_dsfm_folder import read_1dsfm
 from colmap_vg.options import Method
 
 
@@ -31,9 +35,11 @@ def main() -> None:
     parser.add_argument("--output_path", type=Path, required=True, help="receives the folder tables")
     parser.add_argument("--sets", nargs="+", default=list(TABLE_1_SETS), help="of the topology; default: Table 1's")
     parser.add_argument("--seeds", type=int, default=5, help="simulations of each set")
-    methods = [method for method in get_args(Method) if method != "epipolar"]
-    parser.add_argument("--methods", nargs="+", default=list(PAPER_METHODS), choices=methods)
-    parser.add_argument("--six_vertex_draws", type=int, default=500, help="of Fig. 4; 0 leaves it out")
+    parser.add_argument("--methods", nargs="+", default=list(TABLE_METHODS), choices=get_args(Method))
+    parser.add_argument(
+        "--real_edges", type=Path, nargs="+", default=[], help="1DSfM folders whose noise is shown among the ratios"
+    )
+    parser.add_argument("--six_vertex_draws", type=int, default=500, help="of Fig. 4; 0 leaves it and the ratios out")
     parser.add_argument("--quick", action="store_true", help="the smallest set, one simulation, 20 draws: a minute")
     parser.add_argument("--num_threads", type=int, default=1, help="scenes solved at once")
     parser.add_argument("--resume", action="store_true", help="take up scenes that an earlier run finished")
@@ -42,6 +48,11 @@ def main() -> None:
     if arguments.seeds < 1 or arguments.num_threads < 1 or arguments.six_vertex_draws < 0:
         parser.error("--seeds and --num_threads must be at least 1, --six_vertex_draws at least 0")
     methods_wanted = tuple(dict.fromkeys(arguments.methods))
+    paper_methods = tuple(method for method in methods_wanted if method != DEFAULT_METHOD)
+    if not paper_methods:
+        parser.error(f"--methods needs one beside {DEFAULT_METHOD}, which the others are compared with")
+    if arguments.real_edges and not arguments.six_vertex_draws:
+        parser.error("--real_edges are shown among the ratios of noises, which --six_vertex_draws 0 leaves out")
     if arguments.quick:
         arguments.seeds, arguments.six_vertex_draws = 1, min(20, arguments.six_vertex_draws)
     try:
@@ -59,6 +70,7 @@ def main() -> None:
                 for name in arguments.sets
                 for seed in range(arguments.seeds)
             ]
+        real_edges = [edge_noise(folder.resolve().name, read_1dsfm(folder)) for folder in arguments.real_edges]
         work = arguments.output_path / ".work"
         work.mkdir(parents=True, exist_ok=True)
         reports = {}
@@ -69,9 +81,10 @@ def main() -> None:
         folder = write_tables(
             arguments.output_path,
             [reports[job] for job in jobs],
-            six_vertex_methods=methods_wanted if arguments.six_vertex_draws else (),
+            six_vertex_methods=paper_methods if arguments.six_vertex_draws else (),
             num_draws=arguments.six_vertex_draws,
             num_ratio_seeds=1 if arguments.quick else NUM_RATIO_SEEDS,
+            real_edges=real_edges,
             overwrite=arguments.overwrite,
         )
     except colmap_vg.ColmapVgError as error:

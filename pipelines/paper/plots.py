@@ -1,4 +1,4 @@
-"""Figures as SVG text: histograms, bars, points of a graph, lines."""
+"""Figures as SVG text: histograms, alone and side by side, bars, points of a graph, lines."""
 
 import io
 from collections.abc import Mapping
@@ -10,6 +10,7 @@ from colmap_vg.errors import ColmapVgError
 
 try:
     import matplotlib as mpl
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 except ImportError as error:
@@ -18,6 +19,10 @@ except ImportError as error:
 Array = NDArray[np.float64]
 
 SIZE_INCHES = (5.0, 2.7)
+PANEL_INCHES, FRAME_INCHES, PANELS_PER_ROW = (1.8, 1.4), 0.7, 4
+"""Of small multiples; the frame is the height of title and label."""
+EMPTY_BIN = 0.5
+"""Where a logarithmic axis of counts begins."""
 STYLE = {
     "svg.fonttype": "none",  # text stays text
     "svg.hashsalt": "colmap_vg",  # the same figure has the same bytes
@@ -45,9 +50,44 @@ def histogram_svg(title: str, label: str, bins: Array, counts: Mapping[str, Arra
     with mpl.rc_context(STYLE):
         figure, axes = _empty(title)
         for name, values in counts.items():
-            axes.stairs(np.maximum(values, 0.5), bins, baseline=0.5, fill=True, alpha=0.3, label=name)
-        axes.set(xlabel=label, ylabel="edges", yscale="log", ylim=(0.5, None))
+            _outline(axes, bins, values, name)
+        axes.set(xlabel=label, ylabel="edges", yscale="log", ylim=(EMPTY_BIN, None))
         axes.legend(frameon=False)
+        return _text_of(figure)
+
+
+def histograms_svg(title: str, label: str, bins: Array, panels: Mapping[str, Mapping[str, Array]]) -> str:
+    """Small histograms side by side, each as :func:`histogram_svg` draws it, with the same axes.
+
+    Parameters
+    ----------
+    title, label : str
+        `label` is the horizontal axes'.
+    bins : (k + 1,) array
+        Edges of the bins.
+    panels : mapping of name to mapping of name to (k,) array
+        At least one panel: the name over it, and its counts. The legend has the names of all counts.
+    """
+    num_rows = -(-len(panels) // PANELS_PER_ROW)
+    num_columns = min(len(panels), PANELS_PER_ROW)
+    with mpl.rc_context(STYLE):
+        size = (max(PANEL_INCHES[0] * num_columns, SIZE_INCHES[0]), PANEL_INCHES[1] * num_rows + FRAME_INCHES)
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(num_rows, num_columns, sharex=True, sharey=True, squeeze=False).ravel()
+        handles: dict[str, Artist] = {}
+        for axes, (panel, counts) in zip(grid, panels.items(), strict=False):
+            axes.set_title(panel)
+            for name, values in counts.items():
+                handles[name] = _outline(axes, bins, values, name)
+            axes.set(yscale="log", ylim=(EMPTY_BIN, None))
+        for axes in grid[len(panels) :]:
+            axes.set_axis_off()
+        for axes in grid[max(len(panels) - num_columns, 0) : len(panels)]:  # the lowest of each column
+            axes.tick_params(labelbottom=True)
+        figure.suptitle(title)
+        figure.supxlabel(label)
+        figure.supylabel("edges")
+        figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside upper right")
         return _text_of(figure)
 
 
@@ -89,7 +129,13 @@ def points_svg(title: str, edges: NDArray[np.int64], truth: Array, points: Mappi
         return _text_of(figure)
 
 
-def lines_svg(title: str, label: str, height: str, series: Mapping[str, tuple[Array, Array]]) -> str:
+def lines_svg(
+    title: str,
+    label: str,
+    height: str,
+    series: Mapping[str, tuple[Array, Array]],
+    marks: Mapping[str, float] | None = None,
+) -> str:
     """Lines, both axes logarithmic.
 
     Parameters
@@ -97,11 +143,26 @@ def lines_svg(title: str, label: str, height: str, series: Mapping[str, tuple[Ar
     title, label, height : str
         `label` is the horizontal axis's, `height` the vertical one's.
     series : mapping of name to ((k,) abscissas, (k,) ordinates)
+    marks : mapping of name to abscissa, optional
+        Dashed vertical lines with their names.
     """
     with mpl.rc_context(STYLE):
         figure, axes = _empty(title)
         for name, (x, y) in series.items():
             axes.loglog(x, y, marker="o", markersize=3, label=name)
+        for name, x in (marks or {}).items():
+            axes.axvline(x, color="0.4", linewidth=0.8, linestyle="--")
+            axes.annotate(
+                name,
+                (x, 1.0),
+                (-2, -2),
+                axes.get_xaxis_transform(),
+                "offset points",
+                rotation=90,
+                ha="right",
+                va="top",
+                color="0.4",
+            )
         axes.set(xlabel=label, ylabel=height)
         axes.legend(frameon=False)
         return _text_of(figure)
@@ -113,6 +174,11 @@ def _empty(title: str) -> tuple[Figure, Axes]:
     axes.set_title(title)
     axes.set_prop_cycle(STYLE["axes.prop_cycle"])
     return figure, axes
+
+
+def _outline(axes: Axes, bins: Array, counts: Array, name: str) -> Artist:
+    """Draw one histogram with a logarithmic axis of counts."""
+    return axes.stairs(np.maximum(counts, EMPTY_BIN), bins, baseline=EMPTY_BIN, fill=True, alpha=0.3, label=name)
 
 
 def _text_of(figure: Figure) -> str:

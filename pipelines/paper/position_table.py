@@ -1,8 +1,12 @@
-"""Table 1: errors of positions of each method on each set, with m and n after 1DSfM."""
+"""Table 1: errors of positions of each method on each set, with m and n after 1DSfM.
+
+The default method is solved by its own chain, which may register other images. What compares it with the others is over
+the images that all of them register (:func:`with_shared_medians`).
+"""
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,8 +19,13 @@ from paper.markdown import markdown_table
 from paper.scenes import KnownScene
 
 PAPER_METHODS: tuple[Method, ...] = ("cross", "cls", "shapefit", "lud", "bata", "1C", "1O", "2C", "2O")
+DEFAULT_METHOD: Method = "epipolar"
+"""The library's own, which is no method of the paper: it is never in Table 1."""
+TABLE_METHODS: tuple[Method, ...] = (*PAPER_METHODS, DEFAULT_METHOD)
 EARLIER_METHODS = ("cls", "cross")
 """What the paper's methods are to beat."""
+MIN_ALIGNED = 3
+"""Images that determine a similarity."""
 TABLE_TOLERANCE, TABLE_ITERATIONS = 1e-4, 300
 """Relative change of positions at which outer iterations end, and their limit: errors are printed to three digits."""
 
@@ -42,6 +51,9 @@ class MethodErrors:
         Whether the solution is neither doubtful nor short of convergence.
     seconds : float
         Of the whole chain.
+    shared_median : float
+        Median error over the images that the default and every other method register, after the best similarity over
+        them; infinite where they are fewer than three, NaN where the default was not among the methods.
     """
 
     dataset: str
@@ -56,6 +68,7 @@ class MethodErrors:
     num_iterations: int
     converged: bool
     seconds: float
+    shared_median: float = float("nan")
 
 
 def paper_options(method: Method, seed: int = 0) -> SolveOptions:
@@ -72,8 +85,13 @@ def paper_options(method: Method, seed: int = 0) -> SolveOptions:
     )
 
 
+def table_options(method: Method, seed: int = 0) -> SolveOptions:
+    """The paper's chain for its methods, the default options for the default method."""
+    return SolveOptions(random_seed=seed) if method == DEFAULT_METHOD else paper_options(method, seed)
+
+
 def solve_with(scene: KnownScene, method: Method, seed: int) -> tuple[PoseSolution, MethodErrors]:
-    """Solve a scene by the paper's chain and measure the result.
+    """Solve a scene by a method's chain (:func:`table_options`) and measure the result.
 
     Parameters
     ----------
@@ -89,11 +107,11 @@ def solve_with(scene: KnownScene, method: Method, seed: int) -> tuple[PoseSoluti
     MethodErrors
     """
     begin = time.perf_counter()
-    solution = solve_view_graph(scene.graph, paper_options(method, seed))
+    solution = solve_view_graph(scene.graph, table_options(method, seed))
     seconds = time.perf_counter() - begin
     rows = solution.registered & scene.known
     rms = mean = median = turned = float("inf")
-    if rows.sum() >= 3:
+    if rows.sum() >= MIN_ALIGNED:
         errors = position_errors(solution.projection_centers[rows], scene.projection_centers[rows])
         rms, mean, median = errors.rms, errors.mean, errors.median
         turned = rotation_errors(
@@ -112,6 +130,23 @@ def solve_with(scene: KnownScene, method: Method, seed: int) -> tuple[PoseSoluti
         num_iterations=sum(entry.stage == method for entry in solution.log),
         converged=solution.status in (SolutionStatus.SOLVED, SolutionStatus.PARTIAL),
         seconds=seconds,
+    )
+
+
+def with_shared_medians(
+    scene: KnownScene, solved: Mapping[Method, tuple[PoseSolution, MethodErrors]]
+) -> tuple[MethodErrors, ...]:
+    """Errors of each method of a scene with their `shared_median`, as they are without the default among them."""
+    rows = tuple(row for _, row in solved.values())
+    if DEFAULT_METHOD not in solved:
+        return rows
+    shared = scene.known & np.all([solution.registered for solution, _ in solved.values()], axis=0)
+    if shared.sum() < MIN_ALIGNED:
+        return tuple(replace(row, shared_median=float("inf")) for row in rows)
+    truth = scene.projection_centers[shared]
+    return tuple(
+        replace(row, shared_median=position_errors(solution.projection_centers[shared], truth).median)
+        for solution, row in solved.values()
     )
 
 
@@ -141,6 +176,7 @@ def median_over_seeds(rows: Sequence[MethodErrors]) -> list[MethodErrors]:
             num_iterations=round(middle(group, "num_iterations")),
             converged=all(row.converged for row in group),
             seconds=middle(group, "seconds"),
+            shared_median=middle(group, "shared_median"),
         )
         for (dataset, method), group in groups.items()
     ]
