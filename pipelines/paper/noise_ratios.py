@@ -41,8 +41,7 @@ def errors_by_ratio(methods: Sequence[Method], num_seeds: int) -> dict[str, Arra
     -------
     dict of method to (k,) array
     """
-    first = np.repeat(np.arange(NUM_IMAGES), NUM_NEIGHBORS)
-    edges = np.stack([first, (first + np.tile(np.arange(1, NUM_NEIGHBORS + 1), NUM_IMAGES)) % NUM_IMAGES], axis=1)
+    edges = ring_edges(NUM_IMAGES, NUM_NEIGHBORS)
     errors = np.empty((len(methods), len(NOISE_RATIOS), num_seeds))
     for column, ratio in enumerate(NOISE_RATIOS):
         noise = TopologyNoise(
@@ -63,6 +62,13 @@ def errors_by_ratio(methods: Sequence[Method], num_seeds: int) -> dict[str, Arra
                 found = solve_view_graph(scene.graph, options).projection_centers
                 errors[row, column, seed] = position_errors(found, truth).median / radius
     return {method: np.median(errors[row], axis=1) for row, method in enumerate(methods)}
+
+
+def ring_edges(num_images: int, num_neighbors: int) -> NDArray[np.int64]:
+    """Edges of each image on a ring to the following ones, (num_images * num_neighbors, 2)."""
+    first = np.repeat(np.arange(num_images), num_neighbors)
+    second = (first + np.tile(np.arange(1, num_neighbors + 1), num_images)) % num_images
+    return np.stack([first, second], axis=1)
 
 
 def ratio_table(errors: Mapping[str, Array]) -> str:

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.sparse as sp
-from paper.noise_ratios import NOISE_RATIOS, errors_by_ratio
+from paper.noise_ratios import NOISE_RATIOS, errors_by_ratio, ring_edges
 from paper.position_table import MethodErrors, median_over_seeds, table_1, wins
 from paper.scenes import set_conditions
 
+from colmap_vg.datasets.one_dsfm_folder import BUNDLER_FROM_COLMAP_AXES
 from colmap_vg.errors import OptionError
+from colmap_vg.simulation.topology import TopologyNoise, scene_on_topology
 
 pytestmark = pytest.mark.slow
 
@@ -38,15 +40,34 @@ def topology(tmp_path):
     return folder
 
 
+@pytest.fixture
+def real_folder(tmp_path):
+    """Edges of a ring in a 1DSfM folder without truth: noise of 1 degree in rotations and of 2 in directions."""
+    folder = tmp_path / "madrid"
+    folder.mkdir()
+    noise = TopologyNoise(rotation_deg=1.0, direction_deg=2.0, baseline_power=0.0, match_spread=0.0)
+    graph = scene_on_topology(40, ring_edges(40, 12), layout="ring", noise=noise).graph
+    F = BUNDLER_FROM_COLMAP_AXES
+    relative = np.swapaxes(F @ graph.cam2_from_cam1_rotations @ F, 1, 2).reshape(-1, 9)
+    directions = graph.cam2_in_cam1_directions @ F
+    np.savetxt(folder / "EGs.txt", np.hstack([graph.edges, relative, directions]), fmt=["%d"] * 2 + ["%.12f"] * 12)
+    return folder
+
+
+def _texts(path):
+    return {element.text for element in ElementTree.parse(path).iter("{http://www.w3.org/2000/svg}text")}
+
+
 def _run(*arguments):
     return subprocess.run(
         [sys.executable, str(PIPELINE), *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False
     )
 
 
-def test_a_quick_run_writes_tables_and_figures(topology, tmp_path):
+def test_a_quick_run_writes_tables_and_figures(topology, real_folder, tmp_path):
     arguments = ["--topology", topology, "--sets", "Street", "Plaza", "--output_path", tmp_path / "out", "--quick"]
-    arguments += ["--methods", "cross", "cls", "1C", "2O", "--six_vertex_draws", 3]
+    arguments += ["--methods", "cross", "cls", "1C", "2O", "epipolar", "--six_vertex_draws", 3]
+    arguments += ["--real_edges", real_folder]
     finished = _run(*arguments)
     assert finished.returncode == 0, finished.stderr
     folder = tmp_path / "out" / "tables"
@@ -57,12 +78,45 @@ def test_a_quick_run_writes_tables_and_figures(topology, tmp_path):
     assert {row["dataset"] for row in rows} == {"Street"}
     assert all(np.isfinite(float(row["median"])) for row in rows)
     text = (folder / "tables.md").read_text()
-    for heading in ("## Table 1", "## Fig. 2 and 3", "## Fig. 4", "## Which method", "## Fig. 5"):
-        assert heading in text
+    sections = {part.split("\n", 1)[0].split(":")[0]: part for part in text.split("## ")[1:]}
+    assert list(sections) == [
+        "Table 1",
+        "The default beside them",
+        "Times beside pycolmap's rotation averaging",
+        "Fig. 2 and 3",
+        "Fig. 4",
+        "Which method at which ratio of noises",
+        "Fig. 5",
+    ]
+    for name in ("Table 1", "Fig. 4", "Which method at which ratio of noises"):
+        assert "epipolar" not in sections[name]
+    with (folder / "default.csv").open() as stream:
+        (default,) = csv.DictReader(stream)
+    assert default["method"] == "epipolar"
+    least = min(rows, key=lambda row: float(row["shared_median"]))
+    ours, theirs = float(default["shared_median"]), float(least["shared_median"])
+    line, sentence = sections["The default beside them"].split("| Street ")[1].split("\n", 1)
+    shown = [f"**{value:.3g}**" if value == min(ours, theirs) else f"{value:.3g}" for value in (ours, theirs)]
+    assert line == f"| {default['num_images']} | {least['num_images']} | {' | '.join(shown)} | {least['method']} |"
+    assert f"accurate on {int(ours <= theirs)} of 1 sets" in sentence
+    assert f"no fewer images on {int(int(default['num_images']) >= int(least['num_images']))}." in sentence
+    times = sections["Times beside pycolmap's rotation averaging"].split("| Street ")[1].split("\n")[0].split(" | ")
+    num_edges, seconds, *ratios = (float(cell.strip(" |")) for cell in times)
+    assert num_edges == 8 * 30 - 36  # of the band of 30 images
+    assert np.isfinite(seconds)
+    assert len(ratios) == 5
+    assert np.allclose(ratios, [float(row["seconds"]) / seconds for row in [*rows, default]], rtol=0.1)
+    real = sections["Which method at which ratio of noises"].split(f"| {real_folder.name} ")[1].split("\n")[0]
+    assert float(real.split(" | ")[-1].strip(" |")) == pytest.approx(2.0, rel=0.15)
+    assert "Least error among 1C, 2O: " in sections["Which method at which ratio of noises"]
+    assert "At 2, the ratio above that is nearest" in sections["Which method at which ratio of noises"]
     figures = sorted(path.name for path in folder.glob("*.svg"))
-    assert {"fig2_Street.svg", "fig4.svg", "fig4_positions.svg", "ratios.svg"} <= set(figures)
+    assert {"fig2_Street.svg", "fig3.svg", "fig4.svg", "fig4_positions.svg", "ratios.svg"} <= set(figures)
     for name in figures:
         assert ElementTree.parse(folder / name).getroot().tag.endswith("svg")
+    assert {"Street", "CLS", "1C"} <= _texts(folder / "fig3.svg")
+    assert {real_folder.name, "1C"} <= _texts(folder / "ratios.svg")
+    assert "epipolar" not in _texts(folder / "ratios.svg")
     again = _run(*arguments)
     assert again.returncode == 1
     assert again.stderr.startswith("error: ")
