@@ -29,10 +29,9 @@ STYLE = {
     "font.size": 8.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    # Okabe and Ito's colours, which colour-blind readers tell apart.
-    "axes.prop_cycle": mpl.cycler(
-        color=["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#000000"]
-    ),
+    # Okabe and Ito's colours, which colour-blind readers tell apart; once they are used up, with other lines and marks.
+    "axes.prop_cycle": mpl.cycler(linestyle=["-", "--"], marker=["o", "s"])
+    * mpl.cycler(color=["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#000000"]),
 }
 
 
@@ -121,9 +120,11 @@ def points_svg(title: str, edges: NDArray[np.int64], truth: Array, points: Mappi
     """A plane graph and other placements of its vertices: `truth` and each of `points` are (n, 2)."""
     with mpl.rc_context(STYLE):
         figure, axes = _empty(title)
-        axes.plot(*np.moveaxis(truth[edges], 2, 0).swapaxes(1, 2), color="#bbbbbb", linewidth=0.8)
+        axes.plot(
+            *np.moveaxis(truth[edges], 2, 0).swapaxes(1, 2), color="#bbbbbb", linewidth=0.8, linestyle="-", marker=""
+        )
         for name, centers in {"truth": truth, **points}.items():
-            axes.plot(*centers.T, marker="o", linestyle="none", fillstyle="none", label=name)
+            axes.plot(*centers.T, linestyle="none", fillstyle="none", label=name)
         axes.set(aspect="equal", xticks=[], yticks=[])
         axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         return _text_of(figure)
@@ -144,27 +145,21 @@ def lines_svg(
         `label` is the horizontal axis's, `height` the vertical one's.
     series : mapping of name to ((k,) abscissas, (k,) ordinates)
     marks : mapping of name to abscissa, optional
-        Dashed vertical lines with their names.
+        Dotted vertical lines with their names.
     """
     with mpl.rc_context(STYLE):
         figure, axes = _empty(title)
         for name, (x, y) in series.items():
-            axes.loglog(x, y, marker="o", markersize=3, label=name)
-        for name, x in (marks or {}).items():
-            axes.axvline(x, color="0.4", linewidth=0.8, linestyle="--")
-            axes.annotate(
-                name,
-                (x, 1.0),
-                (-2, -2),
-                axes.get_xaxis_transform(),
-                "offset points",
-                rotation=90,
-                ha="right",
-                va="top",
-                color="0.4",
-            )
+            axes.loglog(x, y, markersize=3, label=name)
+        for number, (name, x) in enumerate((marks or {}).items()):
+            axes.axvline(x, color="0.4", linewidth=0.8, linestyle=":")
+            place = {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points"}
+            axes.annotate(name, (x, 0.0), xytext=(3, 3 + 10 * number), color="0.4", **place)
+        ticks = np.unique(np.concatenate([x for x, _ in series.values()]))
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.set_xticks([], minor=True)
         axes.set(xlabel=label, ylabel=height)
-        axes.legend(frameon=False)
+        axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         return _text_of(figure)
 
 
