@@ -258,7 +258,7 @@ def test_sphere2500_against_its_noise_free_truth(data_folder):
 
 
 @pytest.mark.real_data
-@pytest.mark.parametrize("name", ["smallGrid3D", "parking-garage", "sphere2500"])
+@pytest.mark.parametrize("name", ["smallGrid3D", "parking-garage", "sphere2500", "torus3D"])
 def test_minimum_of_gtsam(name, data_folder):
     gtsam = pytest.importorskip("gtsam")
     graph = read_g2o(data_folder / "view_graphs" / "pose_graphs" / f"{name}.g2o")
@@ -288,10 +288,15 @@ def test_minimum_of_gtsam(name, data_folder):
         start.insert(k, gtsam.Pose3(gtsam.Rot3(R[k].T), graph.projection_centers[k]))
         ours.insert(k, gtsam.Pose3(gtsam.Rot3(result.cam_from_world_rotations[k].T), result.projection_centers[k]))
     assert 2.0 * factors.error(ours) == pytest.approx(result.cost, rel=1e-9)
-    factors.addPriorPose3(0, start.atPose3(0), gtsam.noiseModel.Isotropic.Precision(6, 1e3))
     params = gtsam.GaussNewtonParams()
     params.setRelativeErrorTol(1e-12)
     params.setAbsoluteErrorTol(1e-14)
-    params.setMaxIterations(60)
-    optimum = gtsam.GaussNewtonOptimizer(factors, start, params).optimize()
-    assert result.cost == pytest.approx(2.0 * factors.error(optimum), rel=1e-6)
+    costs = []
+    for values, num_iterations in ((start, 60), (ours, 10)):  # on torus3D 60 iterations from the start end 5e-6 above
+        params.setMaxIterations(num_iterations)
+        anchored = gtsam.NonlinearFactorGraph()
+        anchored.push_back(factors)
+        anchored.addPriorPose3(0, values.atPose3(0), gtsam.noiseModel.Isotropic.Precision(6, 1e3))
+        costs.append(2.0 * factors.error(gtsam.GaussNewtonOptimizer(anchored, values, params).optimize()))
+    assert result.cost == pytest.approx(min(costs), rel=1e-6)
+    assert result.cost <= costs[0] * (1.0 + 1e-6)
