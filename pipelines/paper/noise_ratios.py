@@ -104,7 +104,8 @@ def real_edges_text(errors: Mapping[str, Array], noises: Sequence[EdgeNoise]) ->
         " median angle between measured and solved relative poses of the edges that the solution kept, divided by the"
         " median of a chi distribution with three degrees of freedom for rotations and two for directions. It is below"
         " the true noise: a solution fits its edges better than the truth does, and the filters drop those that fit"
-        f" worst. The ratio is affected less, since both hold for rotations and directions.\n\n{noise_table(noises)}"
+        " worst. The ratio is affected less, unless the filters drop many more directions than rotations."
+        f"\n\n{noise_table(noises)}"
     )
     winners = contest_winners(errors)
     for noise in noises if winners else ():
