@@ -127,7 +127,7 @@ def falls_behind(name: str, runs: list[MapperRun]) -> list[str]:
 
 
 def graphs(arguments: argparse.Namespace) -> Result:
-    """The default solve without matches beside rotation averaging alone."""
+    """Solving by 2O beside rotation averaging alone."""
     sets = arguments.sets or topology_sets(arguments.topology)
     for name in sets:
         set_conditions(arguments.topology, name)  # says of an unknown set before any work is done

@@ -55,7 +55,7 @@ def looped_scene(num_images: int, num_edges: int, *, long_share: float = 0.01, s
 
 
 def timed_solve(graph: ViewGraph) -> float:
-    """Seconds of the default solve without matches: robust rotations, gate, CLS and 2O."""
+    """Seconds of solving by 2O: robust rotations, gate, CLS and 2O."""
     start = time.perf_counter()
     solve_view_graph(graph, SolveOptions(method="2O"))
     return time.perf_counter() - start
